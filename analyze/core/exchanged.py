@@ -6,16 +6,19 @@ language following, whether the policy turns to what it was told about, and succ
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import polars as pl
 
 from vla_attention.analyze.core.behaviour import ALONE
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
 from vla_attention.analyze.statistics.units import Sampling
-from vla_attention.schemas.errors import plural
+from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.words import split_words, stop_words
 
 OWN, EXCHANGED = "its own", "another task's"
+KINDS = ("verb", "object", "colour", "place")
 _COLOURS = {"black", "white", "grey", "gray", "red", "green", "blue", "yellow", "orange", "pink", "purple", "brown"}
 _PLACES = {
     "left", "right", "front", "back", "rear", "middle", "center", "centre", "top", "bottom", "leftmost", "rightmost",
@@ -36,13 +39,12 @@ def exchanged(asked: pl.DataFrame, sampling: Sampling) -> tuple[list[Finding], l
         sentence=pl.when(pl.col("told_goal") == pl.col("scene_goal")).then(pl.lit(OWN)).otherwise(pl.lit(EXCHANGED)),
         did_told=pl.col("did") == pl.col("told"),
         did_scene=(pl.col("did") == pl.col("scene_instruction")) & (pl.col("did") != pl.col("told")),
-        kind=pl.Series([kinds_of_words(*pair) for pair in rows.select("told", "scene_instruction").iter_rows()]),
         counted=pl.col("left_out").is_null() | (pl.col("left_out") == ALONE),
     ).with_columns(pl.col("did_told", "did_scene").fill_null(False))
     shown = rows.filter("counted")
-    rates = _rates(shown, "sentence", sampling).sort("sentence", descending=True)
+    rates = _rates(shown, "sentence", ("did_told", "followed", "did_scene"), sampling).sort("sentence", descending=True)
     others = shown.filter(sentence=EXCHANGED)
-    kinds = _rates(others, "kind", sampling).sort("num_episodes", "kind", descending=[True, False])
+    kinds = _rates(_heard(others), "kind", ("as_told", "as_scene"), sampling)
     cells = (
         rows.group_by("task_id", "scene_task_id", "told", "scene_instruction", maintain_order=True)
         .agg(
@@ -54,44 +56,55 @@ def exchanged(asked: pl.DataFrame, sampling: Sampling) -> tuple[list[Finding], l
     )
     tables = [
         Table("exchange", rates, _RATES, "Told which sentence"),
-        Table("exchange_kinds", kinds, _KINDS, "Told another sentence, by the words that differ"),
+        Table("exchange_kinds", kinds, _OF_KINDS, "Told another sentence: which of its words are in what it did"),
         Table("exchange_matrix", cells),
     ]
-    return [_finding(rates, rows.height - shown.height)], tables, [_matrix(cells)]
+    return [_finding(rates, kinds, rows.height - shown.height)], tables, [_matrix(cells)]
 
 
-def kinds_of_words(one: str, other: str) -> str:
-    """The kinds of the words in which two sentences differ: verb, colour, place, object; joined by " + ".
+def words_by_kind(sentence: str) -> dict[str, frozenset[str]]:
+    """The words of a sentence by kind: verb, object, colour, place.
 
-    The verb is the first word. Colours and places are of fixed lists; words without a meaning of their own do not
-    count, and all others are of objects.
+    A verb is the first word, and one behind "and". Colours and places are of fixed lists; words without a meaning of
+    their own do not count, and all others are of objects.
     """
-    first, second = (_words(text) for text in (one, other))
-    different = {*first, *second} - ({*first} & {*second})
-    kinds = {
-        "verb" if word in (first[:1] + second[:1])
-        else "colour" if word in _COLOURS
-        else "place" if word in _PLACES
-        else "object"
-        for word in different - (stop_words() - _PLACES)
-    }  # fmt: skip
-    return " + ".join(kind for kind in ("verb", "object", "colour", "place") if kind in kinds) or "order"
+    words, found = _words(sentence), {kind: set[str]() for kind in KINDS}
+    for place, word in enumerate(words):
+        if word not in stop_words() - _PLACES:
+            is_verb = place == 0 or words[place - 1] == "and"
+            kind = "colour" if word in _COLOURS else "place" if word in _PLACES else "object"
+            found["verb" if is_verb else kind].add(word)
+    return {kind: frozenset(of_kind) for kind, of_kind in found.items()}
+
+
+def _heard(others: pl.DataFrame) -> pl.DataFrame:
+    """A row for each rollout and kind of word in which told sentence and scene's own differ: whose words were done."""
+    rows = []
+    for row in others.iter_rows(named=True):
+        told, scene = words_by_kind(row["told"]), words_by_kind(row["scene_instruction"])
+        did = {} if row["did"] is None else words_by_kind(row["did"])
+        rows += [
+            (row["suite"], row["task_id"], kind, did.get(kind) == told[kind], did.get(kind) == scene[kind])
+            for kind in KINDS
+            if told[kind] != scene[kind]
+        ]
+    schema = {"suite": pl.String, "task_id": pl.Int64, "kind": pl.String, "as_told": pl.Boolean, "as_scene": pl.Boolean}
+    return pl.DataFrame(rows, schema=schema, orient="row")
 
 
 def _words(text: str) -> list[str]:
     return [text[start:stop].casefold() for start, stop in split_words(text)]
 
 
-def _rates(rows: pl.DataFrame, by: str, sampling: Sampling) -> pl.DataFrame:
-    """Shares of the rollouts with each value of a column, with intervals, and their numbers."""
-    shares = ("did_told", "followed", "did_scene")
+def _rates(rows: pl.DataFrame, by: str, shares: Sequence[str], sampling: Sampling) -> pl.DataFrame:
+    """Shares of the rollouts with each value of a column, with intervals; of the first and last also the number."""
     numbers = rows.with_columns(pl.col(*shares).cast(pl.Float64))
     found = estimate(numbers, [by], dict.fromkeys(shares, "share"), sampling)
-    counts = rows.group_by(by).agg(right=pl.col("did_told").sum(), scenes=pl.col("did_scene").sum())
+    counts = rows.group_by(by).agg(right=pl.col(shares[0]).sum(), scenes=pl.col(shares[-1]).sum())
     return found.join(counts, on=by, how="left", maintain_order="left")
 
 
-def _finding(rates: pl.DataFrame, left_out: int) -> Finding:
+def _finding(rates: pl.DataFrame, kinds: pl.DataFrame, left_out: int) -> Finding:
     """How often another task's sentence was followed, beside the scene's own."""
     known = {row["sentence"]: row for row in rates.iter_rows(named=True)}
     other, own = known.get(EXCHANGED), known.get(OWN)
@@ -106,6 +119,9 @@ def _finding(rates: pl.DataFrame, left_out: int) -> Finding:
     sentence = f"Told another task's sentence, it did that in {right} of {n} rollouts{interval}{beside}{instead}."
     if other["followed"] is not None:
         sentence += f" Language following {100 * other['followed']:.0f} %, success {100 * other['did_told']:.0f} %."
+    heard = {row["kind"]: f"{row['right']} of {row['num_episodes']}" for row in kinds.iter_rows(named=True)}
+    words = listing([f"{kind} {heard[kind]}" for kind in KINDS if kind in heard])
+    limit = f"Where told and scene's own differ in a word, what it did has the told one: {words}. {limit}".strip()
     numbers = {"right": right, "n": n, "low": ends[0], "high": ends[1], "following": other["followed"]}
     return Finding(sentence, _ASKS, numbers, limit)
 
@@ -141,4 +157,9 @@ _SHARES = (
     Column("did_scene", "percent", "did the scene's own", "reached the goal of the scene's own sentence instead"),
 )
 _RATES = [Column("sentence", "text"), *_SHARES]
-_KINDS = [Column("kind", "text", "words that differ"), *_SHARES]
+_OF_KINDS = [
+    Column("kind", "text", "word"),
+    Column("num_episodes", "count", "rollouts", "in which told sentence and scene's own differ in words of the kind"),
+    Column("as_told", "percent", "did as told", "what was done has these words of the told sentence"),
+    Column("as_scene", "percent", "did as the scene's own", "or those of the scene's own"),
+]

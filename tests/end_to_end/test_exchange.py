@@ -13,7 +13,7 @@ import vla_attention as va
 from examples.cubes_policy.experts import expert_action, read_state
 from tests.kit.questions import question_about
 from vla_attention.analyze.commands.language import language
-from vla_attention.analyze.core.exchanged import kinds_of_words
+from vla_attention.analyze.core.exchanged import words_by_kind
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.base import Suite, Task
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
@@ -66,24 +66,28 @@ def test_an_arm_that_always_touches_the_red_cube(monkeypatch, tmp_path):
     # A mean over told tasks: 0 touched its red cube, 1 never its green one, 3 its red one in the scene of green. The
     # cube that is touched does not show whether 'touch' or 'lift' was heard of it.
     assert other["followed"] == pytest.approx(2 / 3)
-    kinds = found["exchange_kinds"].select("kind", "num_episodes").rows()
-    assert sorted(kinds) == [("colour", 2), ("verb", 2), ("verb + colour", 2)]
+    kinds = {row["kind"]: row for row in found["exchange_kinds"].iter_rows(named=True)}
+    # 'touch' where 'lift' was told or was the scene's own: never lifted. Red where green was: never green.
+    assert {kind: (row["right"], row["scenes"], row["num_episodes"]) for kind, row in kinds.items()} == {
+        "verb": (2, 2, 4),
+        "colour": (2, 2, 4),
+    }
     cells = found["exchange_matrix"].filter(pl.col("task_id") == 1)
     assert cells.select("scene_task_id", "did_told", "did_scene").rows() == [(0, 0, 1), (1, 0, 0), (3, 0, 0)]
     assert va.open(store) is not None
 
 
 @pytest.mark.parametrize(
-    ("one", "other", "kinds"),
+    ("sentence", "words"),
     [
-        ("put the bowl on the plate", "put the cream cheese in the bowl", "object"),
-        ("open the middle drawer of the cabinet", "open the top drawer", "object + place"),
-        ("push the red cube to the left", "push the red cube to the right", "place"),
-        ("turn on the stove", "turn on the stove", "order"),
+        ("put the bowl on the plate", ("put", "bowl plate", "", "")),
+        ("open the top drawer and put the bowl inside", ("open put", "drawer bowl", "", "top inside")),
+        ("Push the red_cube to the left.", ("push", "cube", "red", "left")),
+        ("", ("", "", "", "")),
     ],
 )
-def test_kinds_of_words(one, other, kinds):
-    assert kinds_of_words(one, other) == kinds_of_words(other, one) == kinds
+def test_words_by_kind(sentence, words):
+    assert [*words_by_kind(sentence).values()] == [frozenset(of_kind.split()) for of_kind in words]
 
 
 SUITE = Suite("made_up", "libero", 5, 10, 50)
