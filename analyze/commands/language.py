@@ -53,10 +53,12 @@ def language(question: Question) -> Result:
     read = words(question, named_at=SHOWN_AT)
     missing = len(question.selected) - asked.height
     left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] if missing else []
+    # Where only effects can answer, they come first.
+    first, last = ([], [behaved]) if asked.is_empty() and effects else ([behaved], [])
     return Result(
         "Does it listen? What was told, and what was done",
         about(question),
-        [*reached, behaved, *followed, *decide, *read.findings[:1]],
+        [*reached, *first, *followed, *decide, *read.findings[:1], *last],
         [*matrix, *(() if matrix else done[:1]), *effects, *done[1:], *read.tables[:1]],
         [*pictured, *read.figures[:1]],
         [*left, *notes(question)],
