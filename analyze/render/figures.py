@@ -238,9 +238,16 @@ def lines(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
         uniform = rows[o["uniform"]].drop_nulls().to_list() if "uniform" in o else []
         value, low, high = _bounds(rows, o["value"])
         finite = value[np.isfinite(value) & (value > 0)]
-        # A band that runs far beyond all values is cut at the frame.
+        # A band that runs far beyond all values is cut at the frame, where a triangle says so.
         ends = np.clip([low, high], finite.min() / 3, finite.max() * 3).ravel()
         ratio_axis(axes.yaxis, np.concatenate([finite, ends, uniform]))
+        bottom, top = axes.get_ylim()
+        for mark, cut, at in (("v", low < bottom, 0.015), ("^", high > top, 0.985)):
+            places = rows[o["x"]].to_numpy()[cut]
+            axes.plot(places, np.full(len(places), at), mark, color=NOTE_COLOR, markersize=4, clip_on=False,
+                      transform=axes.get_xaxis_transform())  # fmt: skip
+        if (low < bottom).any() or (high > top).any():
+            axes.plot([], [], "^", color=NOTE_COLOR, markersize=4, label="the interval goes on")
     else:
         axes.set_ylim(bottom=0)
     if rows[o["x"]].dtype.is_integer():
@@ -281,8 +288,9 @@ def _distribution(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     if o.get("log"):
         ratio_axis(axes.yaxis, np.concatenate([rows[o["value"]].to_numpy(), uniform]))
     if uniform.size:
-        axes.axhspan(uniform.min(), uniform.max(), color="#E6E6E6", linewidth=0, zorder=0)
         axes.axhline(float(np.median(uniform)), color=BASELINE_COLOR, linestyle="--", linewidth=1, label=BASELINE_NAME)
+        if (low := uniform.min()) < (high := uniform.max()):
+            axes.axhspan(low, high, color="#E6E6E6", linewidth=0, zorder=0, label="its range over the episodes")
     label_positions(axes.xaxis, [str(place) for place in places], _MOST_LABELS)
     axes.grid(axis="y")
 
