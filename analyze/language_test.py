@@ -51,10 +51,13 @@ def language_test(
     """
     kinds = prompts if isinstance(prompts, Mapping) else {text: text for text in prompts}
     texts = [(kind, text) for kind, given in kinds.items() for text in ([given] if isinstance(given, str) else given)]
-    if len(inputs) < 2 or not texts:
+    if not all(isinstance(text, str) for text in [*(text for _, text in texts), *(own for _, own in inputs)]):
+        raise BadArgument("A prompt or an input's instruction is no text; expected pairs (observation, instruction).")
+    others = sum(text != own for _, text in texts for _, own in inputs)
+    if len(inputs) < 2 or not others:
         raise BadArgument(
-            f"{plural(len(inputs), 'input')} and {plural(len(texts), 'prompt')} are too few; expected at least two "
-            "inputs, pairs of an observation and its instruction, and one other sentence."
+            f"{plural(len(inputs), 'input')} and {plural(others, 'other sentence')} for them are too few; expected at "
+            "least two inputs, pairs of an observation and its instruction, and a sentence that is not theirs."
         )
     plain = [_actions(call(*given)) for given in inputs]
     if len({actions.shape for actions in plain}) > 1:
@@ -66,7 +69,10 @@ def language_test(
     def rows() -> Iterator[dict[str, Any]]:
         for number, ((observation, own), actions) in enumerate(zip(inputs, plain, strict=True)):
             for kind, text in [(_AGAIN, own), *((kind, text) for kind, text in texts if text != own)]:
-                change = (_actions(call(observation, text)) - actions)[:, spread > 0] / spread[spread > 0]
+                made = _actions(call(observation, text))
+                if made.shape != actions.shape:
+                    raise BadArgument(f"Told '{text}', the actions have the shape {made.shape}, not {actions.shape}.")
+                change = (made - actions)[:, spread > 0] / spread[spread > 0]
                 size = float(np.sqrt(np.mean(change**2)))
                 yield {"suite": "", "task_id": number, "instruction": own, "kind": kind, "told": text, "change": size}
 
@@ -95,30 +101,34 @@ def _findings(found: pl.DataFrame, each: pl.DataFrame) -> list[Finding]:
         sentence = f"Nothing shows that they do: in {plural(n, 'call')} with other words the action is the same."
         limit = "Either the words do not reach the model (key of the data, tokenizer, prompt), or it is deaf."
         return [Finding(sentence, _GETS_THROUGH, {"change": most, "n": n}, limit)]
-    sentence = f"Yes: with other words the action changes, by at most {most:.2g} of its spread."
-    reach = Finding(sentence, _GETS_THROUGH, {"change": most, "n": n})
     top = found.filter(pl.col("kind") != _AGAIN).sort("change", descending=True).row(0, named=True)
     change = f"told '{top['kind']}' the action changes most, by {top['change']:.2g} of its spread"
     noise = float(each["again"].to_numpy().mean())
     times, low, high = (top[name] for name in ("times", "times_low", "times_high"))
+    sentence, hears = f"Yes: with other words the action changes, by at most {most:.2g} of its spread.", True
+    reach = Finding(sentence, _GETS_THROUGH, {"change": most, "n": n})
     if not noise:
         sentence = f"It hears: {change}; told the same again it does not change."
     elif low is not None and low > 1:
         sentence = f"It hears: {change}, {times:.2g} times [{low:.2g}, {high:.2g}] as much as told the same again."
     else:
-        sentence = f"Not shown to hear: {change}, and told the same again by {noise:.2g}."
+        sentence, hears = f"Not shown to hear: {change}, and told the same again by {noise:.2g}.", False
     limit = "Another action need not be the right one: vla-attention capture exchange tries it in rollouts."
-    return [reach, Finding(sentence, _LISTENS, {"change": top["change"], "times": times, "again": noise}, limit)]
+    listens = Finding(sentence, _LISTENS, {"change": top["change"], "times": times, "again": noise}, limit)
+    return [reach, listens] if hears else [listens]  # what noise does as well shows no way of the words
 
 
 def _actions(given: Any) -> NDArray[np.float64]:
     """Actions as (horizon, action dim); a tensor's numbers wherever it is, a batch of one without its axis."""
     values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
-    numbers = np.asarray(values, dtype=np.float64)
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise BadArgument(f"A call gave {type(given).__name__}; expected actions, (horizon, action dim).") from None
     numbers = numbers[0] if numbers.ndim == 3 and len(numbers) == 1 else np.atleast_2d(numbers)
-    if numbers.ndim != 2 or not np.isfinite(numbers).all():
+    if numbers.ndim != 2 or not numbers.size or not np.isfinite(numbers).all():
         raise BadArgument(
-            f"A call gave actions of the shape {np.shape(values)}, or NaN; expected finite ones, (horizon, action dim)."
+            f"A call gave actions of the shape {numbers.shape}, or NaN; expected finite ones, (horizon, action dim)."
         )
     return numbers
 

@@ -42,6 +42,9 @@ def language(question: Question) -> Result:
     """
     asked = with_choices(behaviour(question.episodes))
     behaved = listens(asked)
+    if (source := question.stores[0].attributes.rerun_of) is not None and asked.is_empty():
+        said = f"A rerun executes nothing. What was done is in the run that it came from, {visible(source.name)}."
+        behaved = Finding(said, _LISTENS)
     if not asked.is_empty():
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
         behaved = replace(behaved, next_step=failures)
@@ -52,7 +55,8 @@ def language(question: Question) -> Result:
     # Attention to the words: one call.
     read = words(question, named_at=SHOWN_AT)
     missing = len(question.selected) - asked.height
-    left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] if missing else []
+    rerun = all(store.attributes.rerun_of is not None for store in question.stores)
+    left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] * (missing > 0)
     # Where only effects can answer, they come first.
     first, last = ([], [behaved]) if asked.is_empty() and effects else ([behaved], [])
     return Result(
@@ -61,7 +65,7 @@ def language(question: Question) -> Result:
         [*reached, *first, *followed, *decide, *read.findings[:1], *last],
         [*matrix, *(() if matrix else done[:1]), *effects, *done[1:], *read.tables[:1]],
         [*pictured, *read.figures[:1]],
-        [*left, *notes(question)],
+        [*([] if rerun else left), *notes(question)],
     )
 
 
@@ -87,7 +91,7 @@ def words_get_through(question: Question) -> list[Finding]:
     elif not (worst.action_changed or 0.0) > _SAME_ACTION:
         sentence = f"They reach the model{seen}, and not the action: told {other}, it is the same."
     else:
-        by = f"the action by {worst.action_changed:.2g} of its unit"
+        by = f"the action by {worst.action_changed:.2g} on the scale on which the policy gives it"
         sentence = f"Yes: told {other}, the model's input{seen} and its action change ({by})."
     numbers = {"rows": worst.rows_changed, "action": worst.action_changed, "calls": len(looked)}
     return [Finding(sentence, "Do the words get through?", numbers, limit)]

@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 import polars as pl
 
-from vla_attention.analyze.core.about import about, enough, notes
+from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes
 from vla_attention.analyze.core.axes import OF_ROWS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.measure import measure, table_of
@@ -110,9 +110,7 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named
     """Which words get more, and which less, than evenly spread attention would give them."""
     recorded = any(item.episode.attributes.effects is not None for item in question.selected)
     path = shlex.quote(str(question.stores[0].path))
-    effects = (
-        f"vla-attention effects {path}" if recorded else f"vla-attention capture rerun {path} --effects text,cameras"
-    )
+    effects = f"vla-attention effects {path}" if recorded else how_to_record_effects(question)
     limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
     limit = f"{enough(question)} {limit}".lstrip()
     if by:

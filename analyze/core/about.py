@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,7 @@ from vla_attention.analyze.measures.task_families import unknown_families
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.stores.store_format import RootAttributes
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES, RootAttributes
 
 #: With fewer units than these, an interval about other tasks covers less where these are skewed.
 _FEW = 10
@@ -93,6 +94,14 @@ def _held(units: Units) -> str:
     """How often intervals hold the truth: `benchmarks/interval_coverage.py --only remedies` has the numbers."""
     few = units.estimand.of_other_tasks and len(np.unique(units.clusters)) < _FEW
     return "95% (about 90% if some of so few differ much from the rest)" if few else "95%"
+
+
+def how_to_record_effects(question: Question) -> str:
+    """What records effects of words, pictures and other sentences: a command, or code where the caller loads it."""
+    store = question.stores[0]
+    if store.attributes.policy.checkpoint_format == CALLERS_MODULES:
+        return 'va.record(..., effects="text,cameras"), with replan(repeat=lambda call: ...)'
+    return f"vla-attention capture rerun {shlex.quote(str(store.path))} --effects text,cameras --prompts standard"
 
 
 def only(question: Question, episodes: pl.DataFrame) -> Question:

@@ -41,7 +41,8 @@ def exchanged(asked: pl.DataFrame, sampling: Sampling) -> tuple[list[Finding], l
         did_scene=(pl.col("did") == pl.col("scene_instruction")) & (pl.col("did") != pl.col("told")),
         counted=pl.col("left_out").is_null() | (pl.col("left_out") == ALONE),
     ).with_columns(pl.col("did_told", "did_scene").fill_null(False))
-    shown = rows.filter("counted")
+    # An own sentence has no other one that could have been done instead.
+    shown = rows.filter("counted").with_columns(did_scene=pl.when(pl.col("sentence") != OWN).then("did_scene"))
     rates = _rates(shown, "sentence", ("did_told", "followed", "did_scene"), sampling).sort("sentence", descending=True)
     others = shown.filter(sentence=EXCHANGED)
     kinds = _rates(_heard(others), "kind", ("as_told", "as_scene"), sampling)
@@ -97,10 +98,15 @@ def _words(text: str) -> list[str]:
 
 
 def _rates(rows: pl.DataFrame, by: str, shares: Sequence[str], sampling: Sampling) -> pl.DataFrame:
-    """Shares of the rollouts with each value of a column, with intervals; of the first and last also the number."""
+    """Shares of the rollouts with each value of a column, with intervals; of the first and last also the number.
+
+    seen: how many have a value of the second.
+    """
     numbers = rows.with_columns(pl.col(*shares).cast(pl.Float64))
     found = estimate(numbers, [by], dict.fromkeys(shares, "share"), sampling)
-    counts = rows.group_by(by).agg(right=pl.col(shares[0]).sum(), scenes=pl.col(shares[-1]).sum())
+    counts = rows.group_by(by).agg(
+        right=pl.col(shares[0]).sum(), scenes=pl.col(shares[-1]).sum(), seen=pl.col(shares[1]).count()
+    )
     return found.join(counts, on=by, how="left", maintain_order="left")
 
 
@@ -118,7 +124,8 @@ def _finding(rates: pl.DataFrame, kinds: pl.DataFrame, left_out: int) -> Finding
     instead = f"; in {other['scenes']} it did the scene's own task" if other["scenes"] else ""
     sentence = f"Told another task's sentence, it did that in {right} of {n} rollouts{interval}{beside}{instead}."
     if other["followed"] is not None:
-        sentence += f" Language following {100 * other['followed']:.0f} %, success {100 * other['did_told']:.0f} %."
+        sentence += f" Success {100 * other['did_told']:.0f} %, language following {100 * other['followed']:.0f} %"
+        sentence += f" (of the {other['seen']} whose sentences name different things)."
     heard = {row["kind"]: f"{row['right']} of {row['num_episodes']}" for row in kinds.iter_rows(named=True)}
     words = listing([f"{kind} {heard[kind]}" for kind in KINDS if kind in heard])
     limit = f"Where told and scene's own differ in a word, what it did has the told one: {words}. {limit}".strip()
@@ -128,7 +135,9 @@ def _finding(rates: pl.DataFrame, kinds: pl.DataFrame, left_out: int) -> Finding
 
 def _matrix(cells: pl.DataFrame) -> Figure:
     share = pl.when(pl.col("counted") > 0).then(pl.col("did_told") / pl.col("counted"))
-    frame = cells.with_columns(share=share, scene=pl.col("scene_task_id").cast(pl.String))
+    frame = cells.with_columns(
+        share=share, scene=pl.col("scene_task_id").cast(pl.String), told=pl.format("{} ({})", "told", "task_id")
+    )
     frame = frame.sort("task_id", "scene_task_id", descending=[True, False])
     options = {"x": "scene", "y": "told", "value": "share", "share": True, "label": "did what it was told",
                "xlabel": "in the scene and initial state of task"}  # fmt: skip

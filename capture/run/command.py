@@ -39,7 +39,8 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
 
     run_capture(settings, policy, device, termination)
     if arguments.output_dir is None and not arguments.save_viz:
-        say(f"Next: vla-attention analyze {settings.store}")
+        question = "analyze" if settings.most_rollouts is None else "language"
+        say(f"Next: vla-attention {question} {settings.store}")
         return 0
     return run_analysis(arguments, settings.store, arguments.output_dir)
 

@@ -53,7 +53,7 @@ def exchanged_jobs(
     if len(jobs) > most:
         raise BadArgument(
             f"The exchange takes {len(jobs)} rollouts of at most {max_steps} steps ({_sizes(shared, states)}), and "
-            f"{most} are allowed; choose fewer tasks (--task 0 1 2), or allow them: --rollouts {len(jobs)}."
+            f"{most} are allowed; choose fewer tasks with --task, or allow them: --rollouts {len(jobs)}."
         )
     return jobs
 

@@ -184,8 +184,10 @@ class WatchedCall(ReplanRecorder):
         found = look_at_words_heard(
             prompt, inputs.instruction, actions, inputs.repeat, self._before_first, run._embeddings
         )
-        if found is not None and found.problem:
-            warnings.warn(found.problem, Note)
+        if found is not None and (said := found.problem):
+            warnings.warn(said, Note)
+        elif found is not None and found.why_not and inputs.repeat is not None and run._repeats is None:
+            warnings.warn(f"Whether other words change the action was not tried: {found.why_not}.", Note)
         return found
 
     def _to_be_repeated(

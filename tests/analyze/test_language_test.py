@@ -45,6 +45,7 @@ def test_a_deaf_policy_and_a_noisy_one():
     noisy = va.language_test(lambda place, told: place + draws.normal(size=(4, 2)), INPUTS, ["go right"])
     row = noisy["sentences"].filter(kind="go right").row(0, named=True)
     assert row["times_low"] < 1 < row["times_high"]
+    assert "times" in noisy.findings[0].numbers  # whether words get through is not said of what noise does as well
 
 
 @pytest.mark.parametrize(
@@ -52,6 +53,11 @@ def test_a_deaf_policy_and_a_noisy_one():
     [
         (hears(0), INPUTS[:1], ["x"]),
         (hears(0), INPUTS, []),
+        (hears(0), INPUTS, ["go left"]),
+        (hears(0), INPUTS, {"up": ["a", 3]}),
+        (lambda place, told: {"actions": place}, INPUTS, ["x"]),
+        (lambda place, told: np.full((len(told), 2), place), INPUTS, ["x"]),
+        (lambda place, told: np.zeros((0, 2)), INPUTS, ["x"]),
         (lambda place, told: np.zeros((4, 2)), INPUTS, ["x"]),
         (lambda place, told: np.full((4, 2), np.nan), INPUTS, ["x"]),
         (lambda place, told: np.zeros((1 + int(place), 2)), INPUTS, ["x"]),

@@ -21,13 +21,13 @@ WORDS = ["<pad>", "<bos>", " pick", " up", " the", " red", " bowl", " plate", "\
 
 
 class WordTokenizer:
-    """One token a word."""
+    """One token a word; words that it does not know are all one."""
 
     all_special_ids = (0, 1)
     bos_token_id = 1
 
     def encode(self, text: str) -> list[int]:
-        return [1, *(WORDS.index(f" {word}") for word in text.split()), 8]
+        return [1, *(WORDS.index(f" {word}") if f" {word}" in WORDS else 2 for word in text.split()), 8]
 
     def decode(self, ids: list[int]) -> str:
         return "".join(WORDS[number] for number in ids)

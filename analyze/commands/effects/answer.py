@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Collection
 
 import polars as pl
@@ -22,7 +21,7 @@ from vla_attention.analyze.commands.effects.items import (
     with_untested,
 )
 from vla_attention.analyze.commands.effects.prompts import other_sentences
-from vla_attention.analyze.core.about import about, enough, notes, with_interval
+from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes, with_interval
 from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
 from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
@@ -49,10 +48,9 @@ def effects(question: Question, by: Collection[str] = ()) -> Result:
     found = recorded_effects(question)
     of_data = deviation(question) if has_dataset_actions(question) else ([], [], [])
     if found is None and not of_data[0]:
-        rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text,cameras"
         raise BadArgument(
             f"{question.stores[0].path} holds neither effects nor a data set's actions; its calls can be made again "
-            f"without each word and each picture: {rerun}"
+            f"without each word and each picture: {how_to_record_effects(question)}"
         )
     findings, tables, figures = ([], [], []) if found is None else _recorded(found, by)
     left_out = () if found is None else (*found.notes, *_left_out(found.spread))
@@ -73,10 +71,8 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
     except BadArgument as error:
         return [Finding(f"Not shown: {error}", _DECIDE)], []
     if found is None:
-        rerun = (
-            f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text --prompts standard"
-        )
-        return [Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun)], []
+        said = "Not recorded: how the action changes without a word."
+        return [Finding(said, _DECIDE, next_step=how_to_record_effects(question))], []
     episodes = found.episodes()
     items = with_untested(question, by_item(summary_of(episodes, question.sampling)))
     table = items.filter(item_kind="word")

@@ -72,7 +72,7 @@ def _towards(question: Question) -> tuple[list[Finding], list[Table]]:
     said += f"{with_interval(row, 'changed')} cm closer to it (unchanged: {row['unchanged']:.2g} cm)."
     numbers = {"estimate": row["closer"], "low": row["closer_low"], "high": row["closer_high"], "q": row["closer_q"],
                "n": row["num_episodes"], "left_out": unknown}  # fmt: skip
-    left = f"Left out: {plural(unknown, 'sentence')} of which no task says that they name a single other thing."
+    left = f"{plural(unknown, 'sentence')} left out: they are no task's, or name several things."
     table = Table("effects_directions", found, _DIRECTIONS, "Told of another thing, the next steps go")
     return [Finding(said, "Towards what the words name?", numbers, left if unknown else "")], [table]
 

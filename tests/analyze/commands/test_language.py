@@ -183,7 +183,7 @@ def test_a_rerun_did_nothing_of_its_own(tmp_path):
     base = write_store(tmp_path / "base.zarr", plant_steps=small_steps)
     rerun = write_store(tmp_path / "rerun.zarr", plant_steps=small_steps, rerun_of=rerun_source(base))
     assert language(question_about(base)).findings[0].numbers["n"] == 4
-    assert language(question_about(rerun)).findings[0].sentence.startswith("Nobody knows")
+    assert language(question_about(rerun)).findings[0].numbers == {}
 
 
 def test_other_words_for_the_same_goal_are_a_test_of_it():

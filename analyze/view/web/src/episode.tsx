@@ -2,14 +2,14 @@
 import { signal } from "@preact/signals";
 
 import { Actions } from "./actions";
-import { address } from "./answers";
+import { address, type EpisodeLine } from "./answers";
 import { EffectTable } from "./effects";
 import { HeadGrid } from "./heads";
 import { OwnGroup, Ratio } from "./numbers";
 import { kindOf } from "./overview";
 import { Legend, levels, Pictures } from "./pictures";
 import {
-  about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, type Scene, setPart,
+  about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameInRun, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, type Scene, setPart,
   sides, site, step,
 } from "./state";
 import { shown } from "./sums";
@@ -53,13 +53,16 @@ function Controls() {
   );
 }
 
-/** Episodes that may stand beside this one: the same one of another run first, then those of its task. */
+/** In an exchange, whether two episodes began in the same state of one scene, told different sentences. */
+const begunAlike = (one: EpisodeLine, other: EpisodeLine): boolean => one.scene != null && one.scene === other.scene && one.episode === other.episode;
+
+/** Episodes that may stand beside this one: the same one of another run first, then those of its task or beginning. */
 function ChooseBeside() {
   const episode = about.value.value;
   if (!episode) return null;
   const known = (runs.value.value?.runs ?? []).flatMap(({ name: ofRun, episodes }, i) =>
-    episodes.filter(({ name, task }) => (i !== runNumber.value && name === episode.name) || (task === episode.task && (i !== runNumber.value || name !== episode.name)))
-      .map((line) => ({ line, run: i, title: `${i === runNumber.value ? "" : `${ofRun}, `}episode ${line.episode}${line.outcome === false ? ", failed" : ""}` })),
+    episodes.filter((line) => (i !== runNumber.value || line.name !== episode.name) && (line.name === episode.name || line.task === episode.task || begunAlike(line, episode)))
+      .map((line) => ({ line, run: i, title: `${i === runNumber.value ? "" : `${ofRun}, `}${nameInRun(line)}${line.outcome === false ? ", failed" : ""}` })),
   );
   known.sort((a, b) => Number(b.line.name === episode.name) - Number(a.line.name === episode.name));
   return known.length ? (

@@ -9,8 +9,8 @@ const FAILED = ["failed", "fails", "failure", "unsolved", "unsuccessful"];
 
 /** Whether an episode fits all words of a search; "failed", "not solved" and "solved" are outcomes. */
 export function fits(line: EpisodeLine, search: string): boolean {
-  const text = search.toLowerCase().replace(/\btask (?=\d)/g, "task").replace(/\bnot (solved|successful)\b/g, "failed");
-  const known = [`task${line.task}`, line.name, line.instruction, line.told, line.verdict, line.failed].join(" ").toLowerCase();
+  const text = search.toLowerCase().replace(/\b(task|scene) (?=\d)/g, "$1").replace(/\bnot (solved|successful)\b/g, "failed");
+  const known = [`task${line.task}`, line.scene == null ? "" : `scene${line.scene}`, line.name, line.instruction, line.told, line.verdict, line.failed].join(" ").toLowerCase();
   return text.split(/\s+/).filter(Boolean).every((word) => {
     if (FAILED.includes(word)) return line.outcome === false;
     if (["solved", "successful", "success"].includes(word)) return line.outcome === true;
@@ -76,7 +76,7 @@ function Card({ line }: { line: EpisodeLine }) {
 /** An exchange: what was told, in whose scene. A cell opens its episode. */
 function Matrix() {
   const lines = listed.value.filter(({ scene }) => scene != null);
-  if (!lines.length) return null;
+  if (!lines.length || run.value?.rerun) return null; // a rerun executes nothing
   const scenes = [...new Set(lines.map(({ scene }) => scene!))].sort((a, b) => a - b);
   const told = new Map(lines.map(({ task, instruction }) => [task, instruction]));
   return (

@@ -2,7 +2,7 @@
 import { batch, computed, effect, type ReadonlySignal, type Signal, signal } from "@preact/signals";
 
 import {
-  type About, address, type Covered, type Effect, type Effects, type EpisodeEvent, type Groups, type NumberArray, readArray,
+  type About, address, type Covered, type Effect, type Effects, type EpisodeEvent, type EpisodeLine, type Groups, type NumberArray, readArray,
   readJson, readJsonNow, readRuns, type RunNumbers, type SiteLayout, type Word,
 } from "./answers";
 import { type Choice, keyMasses } from "./sums";
@@ -234,10 +234,14 @@ export interface Side {
 }
 export const sides = computed<readonly Side[]>(() => [{ scene: main, at: replan.value }, ...(beside.about.value.value ? [{ scene: beside, at: besideReplan.value }] : [])]);
 
+/** In an exchange an episode is known by what it was told, and where. */
+export const nameInRun = (line: EpisodeLine): string => (line.scene == null ? `episode ${line.episode}` : `told '${line.told}', scene ${line.scene}`);
+
 /** As "told.zarr, episode 3"; empty where one episode is shown alone. */
 export function nameOf({ scene }: Side): string {
   const other = scene.run.value === runNumber.value ? "" : `${runs.value.value?.runs[scene.run.value]?.name}, `;
-  return sides.value.length > 1 ? `${other}episode ${scene.about.value.value?.episode}` : "";
+  const line = scene.about.value.value;
+  return sides.value.length > 1 && line ? `${other}${nameInRun(line)}` : "";
 }
 
 export function wordsOf({ scene, at }: Side): readonly Word[] {
