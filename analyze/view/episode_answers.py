@@ -304,6 +304,8 @@ class ShownEpisode:
         question = self.question(site, groups=(f"own={selector}",))
         check_names(question.grouping, question.vocabulary)
         weights = resolve_episode(question.grouping, question.selected[0]).weights[..., 0]
+        if not weights.any():
+            raise BadArgument(f"'{selector}' takes no key of this episode.")
         if (weights == weights[:1]).all():
             weights = weights[:1]
         return {"keys": [[[int(key), float(line[key])] for key in np.flatnonzero(line)] for line in weights]}

@@ -49,7 +49,7 @@ function Grid({ side, highest }: { side: Side; highest: number }) {
   };
   return (
     <div>
-      <p>{nameOf(side) ? `${nameOf(side)}: ` : ""}{place ? `most: layer ${numbers.layers[place[0]]}, head ${numbers.heads[place[1]]}, ${shown(best)} times even` : "none, it is out of sight in this call"}</p>
+      <p>{nameOf(side) ? `${nameOf(side)}: ` : ""}{place ? `most: layer ${numbers.layers[place[0]]}, head ${numbers.heads[place[1]]}, ${shown(best)} times even${best > 1 ? "" : ": no head looks more than evenly"}` : "none, it is out of sight in this call"}</p>
       <table>
         <tbody>
           {grid.map((line, i) => (
