@@ -15,7 +15,7 @@ from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing, plural
-from vla_attention.schemas.groupings.words import split_words, stop_words
+from vla_attention.schemas.groupings.words import folded_words, stop_words
 
 OWN, EXCHANGED = "its own", "another task's"
 KINDS = ("verb", "object", "colour", "place")
@@ -69,7 +69,7 @@ def words_by_kind(sentence: str) -> dict[str, frozenset[str]]:
     A verb is the first word, and one behind "and". Colours and places are of fixed lists; words without a meaning of
     their own do not count, and all others are of objects.
     """
-    words, found = _words(sentence), {kind: set[str]() for kind in KINDS}
+    words, found = folded_words(sentence), {kind: set[str]() for kind in KINDS}
     for place, word in enumerate(words):
         if word not in stop_words() - _PLACES:
             is_verb = place == 0 or words[place - 1] == "and"
@@ -91,10 +91,6 @@ def _heard(others: pl.DataFrame) -> pl.DataFrame:
         ]
     schema = {"suite": pl.String, "task_id": pl.Int64, "kind": pl.String, "as_told": pl.Boolean, "as_scene": pl.Boolean}
     return pl.DataFrame(rows, schema=schema, orient="row")
-
-
-def _words(text: str) -> list[str]:
-    return [text[start:stop].casefold() for start, stop in split_words(text)]
 
 
 def _rates(rows: pl.DataFrame, by: str, shares: Sequence[str], sampling: Sampling) -> pl.DataFrame:

@@ -23,6 +23,7 @@ from vla_attention.capture.recording.recorder import AttentionRecorder, make_rec
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.plumbing import Plumbing
 from vla_attention.schemas.stores.store_format import Recording
 
 
@@ -151,10 +152,12 @@ def record_of(
     recording: Recording,
     effects: EpisodeEffectsMeasured | None,
     noise_seed: int | None,
+    plumbing: Plumbing | None = None,
 ) -> ReplanRecord:
     """Return what is stored of a call that was made, with its effects.
 
     rows, actions: what it gave. effects: what measures its effects, None for none. noise_seed: the stored one.
+    plumbing: of the first call of a process.
     """
     given = call.policy_input
     measured = None
@@ -175,4 +178,5 @@ def record_of(
         base_actions=call.base_actions,
         constant_cameras=call.constant_cameras,
         effects=measured,
+        plumbing=plumbing,
     )

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -304,8 +304,7 @@ class EpisodeLoop:
             running.effects = None if caller.effects is None else caller.effects.begin()
         running.num_replans += 1
         recording, effects = caller.recording, running.effects
-        record = record_of(call, made.rows, made.actions, recording, effects, call.noise_seed)
-        running.writer.append(replace(record, plumbing=plumbing))
+        running.writer.append(record_of(call, made.rows, made.actions, recording, effects, call.noise_seed, plumbing))
 
     @contextmanager
     def _dropping_faults(self, running: _Running) -> Iterator[None]:

@@ -11,8 +11,9 @@ from msgspec import structs
 
 from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall
 from vla_attention.capture.policies.policy import PolicyInput, UnitsPolicy
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.groupings.words import split_words
+from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.plumbing import Plumbing
 
@@ -25,13 +26,12 @@ def look_at_words(caller: Caller, calls: Sequence[PolicyCall], made: Sequence[Re
 
     Nothing of it is recorded, and the random numbers are as before: the run's actions are the same to the bit.
     """
-    states = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002 - a policy may draw from it
+    before = RandomNumbers()
     counted = caller.changes.num_replans, caller.changes.num_empty
     try:
         return structs.replace(_changed(caller, calls[0], made[0]), row_of_another=_row_of_another(caller, calls, made))
     finally:
-        torch.set_rng_state(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
+        before.again()
         caller.changes.num_replans, caller.changes.num_empty = counted
 
 
@@ -42,10 +42,8 @@ def unread_words(prompt: Prompt, instruction: str) -> tuple[str, ...]:
     """
     if not prompt.pieces:
         return ()
-    spelled = prompt.text[prompt.pieces[0].start : max(piece.stop for piece in prompt.pieces)].casefold()
-    read = [spelled[start:stop] for start, stop in split_words(spelled)]
-    words = [instruction[start:stop].casefold() for start, stop in split_words(instruction)]
-    return tuple(word for word in dict.fromkeys(words) if word not in read)
+    read = folded_words(prompt.text[prompt.pieces[0].start : max(piece.stop for piece in prompt.pieces)])
+    return tuple(word for word in dict.fromkeys(folded_words(instruction)) if word not in read)
 
 
 def _changed(caller: Caller, call: PolicyCall, made: RecordedCall) -> Plumbing:
@@ -100,5 +98,5 @@ def _row_of_another(caller: Caller, calls: Sequence[PolicyCall], made: Sequence[
     call = calls[place]
     mixed = caller.policy.prepare_again(replace(call.policy_input.given, instruction=first))
     ways = [caller.make([one])[0] for one in (call, replace(call, policy_input=mixed))]
-    own, wrong = (np.abs(way.actions - made[place].actions).max() for way in ways if isinstance(way, RecordedCall))
-    return None if own == wrong else bool(wrong < own)
+    away = [np.abs(way.actions - made[place].actions).max() for way in ways if isinstance(way, RecordedCall)]
+    return None if len(away) < len(ways) or away[0] == away[1] else bool(away[1] < away[0])

@@ -11,10 +11,11 @@ from typing import Any
 
 from torch import Tensor
 
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape, Watcher
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
-from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument
 
 #: How many queries of a call the product of rows and values is checked for.

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.resolution import run_vocabularies, site_tokens
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention, aligned
@@ -23,7 +24,7 @@ from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
-from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument, listing, runs_of
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selector_weights import selector_weights

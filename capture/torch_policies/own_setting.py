@@ -18,11 +18,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument
 
 #: The weight of the last key of a changed row, as a factor; the first key's stays, those between follow.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.engine.call import PolicyCall, record_of
 from vla_attention.capture.interventions.changed_inputs import CallContext
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.torch_policies.attention_calls import CallShape
@@ -25,7 +26,7 @@ from vla_attention.capture.torch_policies.repeated_calls import OWN_NOISE, CallI
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs, read_actions
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
-from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.capture.torch_policies.words_heard import look_at_words_heard
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.layout import Prompt
@@ -172,8 +173,7 @@ class WatchedCall(ReplanRecorder):
             call = self._to_be_repeated(call, one, actions, self._before)
         effects = one.episode._effects
         plumbing = self._look_at_words(one, prompt, actions)
-        record = record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed)
-        return replace(record, plumbing=plumbing)
+        return record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed, plumbing)
 
     def _look_at_words(self, one: RowOfCall, prompt: Prompt, actions: NDArray[np.float64] | None) -> Plumbing | None:
         """Return whether the instruction gets through, of the first call of the run; None of later ones."""

@@ -24,6 +24,7 @@ from vla_attention.capture.interventions.changed_inputs import GREY
 from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput, VariantMemory
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
@@ -32,7 +33,7 @@ from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, Rec
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
-from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, Note, UserError
 from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording

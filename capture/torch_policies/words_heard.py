@@ -11,9 +11,9 @@ from torch import nn
 
 from vla_attention.capture.effects.measurement import MOST_DIFFERENCE
 from vla_attention.capture.engine.plumbing import WHOLLY_DIFFERENT, unread_words
+from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.replan_text import PromptIds
-from vla_attention.capture.torch_policies.watch import RandomNumbers
 from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.plumbing import Plumbing
 
