@@ -37,7 +37,7 @@ CAPTURE_ARGS := --num-episodes $(or $(EPISODES),$(if $(BUILT_IN),2,5)) $(if $(fi
 
 PYTHON ?= python3
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt
 SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs examples
 
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
@@ -79,7 +79,7 @@ faults: .venv/capture-installed
 package: .venv/capture-installed
 	$(BIN)/python scripts/check_package.py
 
-# As `pip install` finds them today, without constraints.txt; PYTHONS="python3.12 /opt/python3.14/bin/python" names interpreters.
+# As `pip install` finds them today, without scripts/constraints.txt; PYTHONS="python3.12 /opt/python3.14/bin/python" names interpreters.
 package-newest: .venv/capture-installed
 	$(BIN)/python scripts/check_package.py --newest $(PYTHONS)
 
@@ -87,7 +87,7 @@ package-newest: .venv/capture-installed
 test-numpy1: .venv-numpy1/installed
 	.venv-numpy1/bin/pytest tests/schemas tests/analyze tests/capture/torch_policies tests/capture/recording tests/capture/store tests/kit $(ARGS)
 
-# Layouts of policies on small random models of the real classes. Neither environment fits constraints.txt, nor the other:
+# Layouts of policies on small random models of the real classes. Neither environment fits scripts/constraints.txt, nor the other:
 # transformers 5 and LeRobot 0.4.4 want different versions of the same libraries.
 test-policies: .venv-transformers/installed .venv-lerobot/installed
 	.venv-transformers/bin/pytest tests/policies $(ARGS)
@@ -112,7 +112,7 @@ audit: .venv/capture-installed .venv-audit/installed
 
 # Strict: a link to a page or a heading that is not there is an error; then the built pages are read for more.
 docs: .venv-docs/installed .venv/analyze-installed
-	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet -f scripts/mkdocs.yml
 	$(BIN)/vla-attention view $$($(BIN)/python -c 'import vla_attention as va; print(va.example("cubes"))') --site site/explore
 	.venv-docs/bin/python scripts/check_site.py site
 
@@ -142,16 +142,18 @@ setup-analyze: .venv/analyze-installed
 	$(PYTHON) -m venv .venv
 
 # The laptop: numpy, zarr, polars, matplotlib and what they need.
-.venv/analyze-installed: .venv/bin/python pyproject.toml constraints.txt
+.venv/analyze-installed: .venv/bin/python pyproject.toml scripts/constraints.txt
 	@echo "Installing the analysis environment into .venv ..."
 	$(PIP) -e .
 	@touch $@
 
-# The GPU node: torch and the simulators on top of it, and what the tests need.
-.venv/capture-installed: .venv/analyze-installed requirements-libero.txt
+# The GPU node: torch and the simulators on top of it, and what the tests need. LIBERO comes without its declared
+# dependencies: those would bring torchvision, and with it a second torch of several GB, besides robomimic, wandb and hydra.
+# What its environments really import is the extra [capture].
+.venv/capture-installed: .venv/analyze-installed
 	@echo "Installing the capture environment into .venv (torch, MuJoCo, robosuite, LIBERO; a minute or more) ..."
 	$(PIP) -e '.[capture,cosmos,openpi,hub,dev]'
-	$(PIP) --no-deps --use-pep517 -r requirements-libero.txt
+	$(PIP) --no-deps --use-pep517 hf-libero bddl
 	sh scripts/ensure_rendering.sh
 	@touch $@
 
@@ -175,10 +177,10 @@ setup-analyze: .venv/analyze-installed
 	.venv-numpy1/bin/python -m pip install --quiet --disable-pip-version-check 'numpy<2' torch==2.13.0 -e '.[capture,dev]'
 	@touch $@
 
-.venv-remote/installed: pyproject.toml constraints.txt
+.venv-remote/installed: pyproject.toml scripts/constraints.txt
 	@echo "Installing s3fs and moto's server into .venv-remote ..."
 	$(PYTHON) -m venv .venv-remote
-	.venv-remote/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[remote]' 'moto[server]>=5' pytest hypothesis
+	.venv-remote/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e '.[remote]' 'moto[server]>=5' pytest hypothesis
 	@touch $@
 
 .venv-docs/installed: docs/requirements.txt
@@ -187,10 +189,10 @@ setup-analyze: .venv/analyze-installed
 	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check -r docs/requirements.txt
 	@touch $@
 
-.venv-notebooks/installed: pyproject.toml constraints.txt
+.venv-notebooks/installed: pyproject.toml scripts/constraints.txt
 	@echo "Installing nbclient and ipykernel into .venv-notebooks ..."
 	$(PYTHON) -m venv .venv-notebooks
-	.venv-notebooks/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e . nbclient ipykernel
+	.venv-notebooks/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e . nbclient ipykernel
 	@touch $@
 
 .venv-audit/installed:

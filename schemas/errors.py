@@ -111,7 +111,7 @@ def plural(count: int, noun: str) -> str:
 
 #: torch, MuJoCo, robosuite and what belongs to them.
 INSTALL_CAPTURE = "pip install 'vla-attention[capture]', or 'make setup' in a checkout"
-#: LIBERO without what it declares (see requirements-libero.txt, which has the same versions).
+#: LIBERO without what it declares (scripts/constraints.txt has the same versions).
 INSTALL_LIBERO = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
 
 

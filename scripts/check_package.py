@@ -8,8 +8,8 @@ can run without a second copy of torch. A store is captured in "node" and analys
 failed.
 
 With --newest, instead: on each interpreter that is there (python3.11 to python3.13, or those that are named), what
-`pip install 'vla-attention[capture]'` takes today, without constraints.txt, records an episode and analyses it. torch
-may bring CUDA's libraries, several gigabytes for each interpreter.
+`pip install 'vla-attention[capture]'` takes today, without the versions of scripts/constraints.txt, records an episode
+and analyses it. torch may bring CUDA's libraries, several gigabytes for each interpreter.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def make_environments(wheel: Path, folder: Path) -> tuple[Path, Path]:
     for environment in (laptop, node):
         run(sys.executable, "-m", "venv", "--clear", "--without-pip", environment)
     pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
-    run(*pip, "--python", laptop / "bin/python", "install", "--constraint", ROOT / "constraints.txt", wheel)
+    run(*pip, "--python", laptop / "bin/python", "install", "--constraint", ROOT / "scripts/constraints.txt", wheel)
     run(*pip, "--python", node / "bin/python", "install", "--no-deps", wheel)
     (libraries,) = node.glob("lib/python*/site-packages")
     # A folder named in a .pth file is searched after the environment's own, and .pth files in it (editable installs)

@@ -1,4 +1,4 @@
-"""What mkdocs does beside its own work when it builds the documentation site; `mkdocs.yml` names this file.
+"""What mkdocs does beside its own work when it builds the documentation site; `scripts/mkdocs.yml` names this file.
 
 - Pages that stand outside of docs/ are on the site too: README.md is its first page. Links between both are translated,
   and a link whose text is the name of its file gets the page's name in the list of pages.

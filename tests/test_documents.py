@@ -144,6 +144,6 @@ def test_the_site_has_every_page_once():
             for part in entry.values() if isinstance(entry, dict) else entry:
                 yield from pages(part)
 
-    listed = list(pages(yaml.safe_load(text_of(ROOT / "mkdocs.yml"))["nav"]))
+    listed = list(pages(yaml.safe_load(text_of(ROOT / "scripts/mkdocs.yml"))["nav"]))
     written = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
     assert sorted(listed) == sorted([*written, *(page for page in OUTSIDE.values() if page.endswith(".md"))])

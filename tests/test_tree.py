@@ -9,10 +9,9 @@ import pytest
 from tests.kit.paths import ROOT
 
 TOP = {
-    ".ci", ".github", ".gitignore", ".pre-commit-config.yaml", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
-    "LICENSE", "MANIFEST.in", "Makefile", "README.md", "analyze", "benchmarks", "capture", "constraints.txt",
-    "docs", "examples", "mkdocs.yml", "paper.bib", "paper.md", "pyproject.toml", "requirements-libero.txt",
-    "schemas", "scripts", "tests", "vla_attention",
+    ".ci", ".github", ".gitignore", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "Makefile",
+    "README.md", "analyze", "benchmarks", "capture", "docs", "examples", "pyproject.toml", "schemas", "scripts", "tests",
+    "vla_attention",
 }  # fmt: skip
 
 

@@ -1,8 +1,7 @@
-"""The version stands in pyproject.toml; whatever repeats it says the same."""
+"""The version stands in pyproject.toml; the installed package says the same."""
 
 from __future__ import annotations
 
-import re
 import tomllib
 
 import vla_attention as va
@@ -13,9 +12,3 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 
 def test_the_installed_version_is_that_of_pyproject():
     assert va.__version__ == PROJECT["version"]
-
-
-def test_the_citation_has_the_version():
-    assert re.findall(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE) == [
-        PROJECT["version"]
-    ]

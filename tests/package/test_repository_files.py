@@ -1,4 +1,4 @@
-"""Workflows and citation: they parse, and name what exists."""
+"""Workflows parse, and name what exists."""
 
 from __future__ import annotations
 
@@ -36,11 +36,3 @@ def test_workflows_may_only_read_and_run_what_exists(workflow):
             assert target in targets
         for path in re.findall(r"(?<![\w/])((?:scripts|tests|\.ci)/\S+)", command):
             assert (ROOT / path).exists(), path
-
-
-def test_the_citation_has_what_its_format_asks_for():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert {"cff-version", "message", "title", "authors"} <= set(citation)
-    assert citation["type"] == "software"
-    assert all("name" in author or "family-names" in author for author in citation["authors"])
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d", str(citation["date-released"]))
