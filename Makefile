@@ -38,7 +38,7 @@ CAPTURE_ARGS := --num-episodes $(or $(EPISODES),$(if $(BUILT_IN),2,5)) $(if $(fi
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt
-SOURCES := vla_attention schemas capture analyze tests benchmarks scripts docs examples
+SOURCES := vla_attention schemas capture analyze tests benchmarks scripts examples
 
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
 WORKERS ?= 2
@@ -117,11 +117,11 @@ docs: .venv-docs/installed .venv/analyze-installed
 	.venv-docs/bin/python scripts/check_site.py site
 
 pictures: .venv/analyze-installed
-	$(BIN)/python docs/make_pictures.py --run $(STORE)
-	$(BIN)/python docs/make_samples.py
+	$(BIN)/python scripts/make_pictures.py --run $(STORE)
+	$(BIN)/python scripts/make_samples.py
 
 screenshots: .venv/capture-installed
-	$(BIN)/python docs/make_screenshots.py $(STORE)
+	$(BIN)/python scripts/make_screenshots.py $(STORE)
 
 schemas: .venv/capture-installed
 	$(BIN)/python -m vla_attention.schemas.json_files

@@ -10,8 +10,8 @@ from tests.kit.paths import ROOT
 
 TOP = {
     ".ci", ".github", ".gitignore", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "MANIFEST.in", "Makefile",
-    "README.md", "analyze", "benchmarks", "capture", "docs", "examples", "pyproject.toml", "schemas", "scripts", "tests",
-    "vla_attention",
+    "README.md", "analyze", "benchmarks", "capture", "docs", "examples", "pyproject.toml", "schemas", "scripts",
+    "tests", "vla_attention",
 }  # fmt: skip
 
 

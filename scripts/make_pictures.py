@@ -1,6 +1,6 @@
 """Draw the pictures of README.md and of `docs/interpreting.md`, with the tool's own commands.
 
-Usage: python docs/make_pictures.py [--run runs/cubes.zarr] [--folder docs/pictures]
+Usage: python scripts/make_pictures.py [--run runs/cubes.zarr] [--folder docs/pictures]
 
 Those of README.md are of the run of `make capture`; those of the guide are of made-up rows with a known truth.
 `make pictures` draws both.
@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import libero_tokens
@@ -93,7 +93,7 @@ def draw(name: str, store: Path, command: list[str], picture: str | None, scratc
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--folder", type=Path, default=Path(__file__).parent / "pictures")
+    parser.add_argument("--folder", type=Path, default=Path(__file__).resolve().parents[1] / "docs/pictures")
     parser.add_argument("--run", type=Path, help="the store of `make capture`; without it README.md keeps its pictures")
     arguments = parser.parse_args()
     folder = arguments.folder

@@ -1,6 +1,6 @@
 """Print again what README.md and the guides show of the run of `make capture`, and write it into their blocks.
 
-Usage: python docs/make_samples.py [PAGE ...]
+Usage: python scripts/make_samples.py [PAGE ...]
 
 A sample is a block that follows a comment `<!-- sample: COMMAND && COMMAND :: LINES -->`. The commands are run, and the
 last one's output becomes the block: all of it, or LINES such as `1-6 20-25`, with `...` for what lies between. Another

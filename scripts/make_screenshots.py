@@ -1,6 +1,6 @@
 """Draw `docs/pictures/viewer_*.png`: the page of `vla-attention view`, in the machine's Chromium.
 
-python docs/make_screenshots.py [STORE], a store of `make capture ARGS="--effects text,objects"`
+python scripts/make_screenshots.py [STORE], a store of `make capture ARGS="--effects text,objects"`
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.kit.browser import Watched, chromium, watched_page
 from tests.kit.viewer import served
 from vla_attention.schemas.errors import BadArgument
 
-FOLDER = Path(__file__).parent / "pictures"
+FOLDER = Path(__file__).resolve().parents[1] / "docs/pictures"
 FIRST = {"episode": "task003_episode000", "replan": "3"}
 
 
