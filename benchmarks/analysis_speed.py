@@ -4,7 +4,7 @@ Usage: OMP_NUM_THREADS=2 python benchmarks/analysis_speed.py [--store PATH] [--e
 
 Writes a store of the shape of pi0.5 in LIBERO with the real writer, unless it exists: ten tasks, 18 layers, 8 heads,
 first and last denoise step, 978 keys, rows averaged over the queries, made-up rows with sinks and heavy tails. What it
-measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The parts:
+measures goes to benchmarks/rows/analysis_speed.json; nothing is asserted. The parts:
 
     scan       in one process, in turn, with OMP_NUM_THREADS threads: decoding every chunk of the rows (read, crc32c,
                Blosc) and nothing else; masses of words; the whole question from opening the store to tables with

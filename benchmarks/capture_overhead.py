@@ -15,7 +15,7 @@ The usual way stands beside it: eager attention that returns whole matrices (eve
 denoise steps to every key, key heads repeated, softmax in float32), each moved with `.cpu().numpy()` as its layer is
 done.
 
---save writes the rows to docs/benchmarks/capture_overhead.json.
+--save writes the rows to benchmarks/rows/capture_overhead.json.
 """
 
 from __future__ import annotations
@@ -197,7 +197,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", default="float32")
     parser.add_argument("--clock", choices=("wall", "processor"), default="processor")
-    parser.add_argument("--save", action="store_true", help="write docs/benchmarks/capture_overhead.json")
+    parser.add_argument("--save", action="store_true", help="write benchmarks/rows/capture_overhead.json")
     arguments = parser.parse_args()
     fix_threads(1)
     clock = time.perf_counter if arguments.clock == "wall" else time.process_time

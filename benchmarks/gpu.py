@@ -2,7 +2,7 @@
 
 Usage: python benchmarks/gpu.py [--device cuda] [--rounds 15] [--minutes 7]
 
-It runs unattended, took three minutes on an H200, and writes docs/benchmarks/gpu.json after every part, so that a part
+It runs unattended, took three minutes on an H200, and writes benchmarks/rows/gpu.json after every part, so that a part
 that fails or finds no time takes nothing from the others. The weights are random (3.35 billion parameters, the sizes of
 pi05_libero; drawn on the GPU). Without a GPU it says so and ends with exit code 2.
 

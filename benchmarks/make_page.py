@@ -1,4 +1,4 @@
-"""Write the tables of docs/benchmarks/*.json into docs/benchmarks.md, between the lines that name them.
+"""Write the tables of benchmarks/rows/*.json into benchmarks/README.md, between the lines that name them.
 
 Usage: python benchmarks/make_page.py [--check]
 
@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from measurement import ROOT, ROWS, read_rows
 
-PAGE = ROOT / "docs" / "benchmarks.md"
+PAGE = ROOT / "benchmarks" / "README.md"
 _BLOCK = re.compile(
     r"(<!-- table (?P<file>[\w-]+)/(?P<table>[\w-]+) -->\n)(?P<body>.*?)(<!-- end of (?P=file)/(?P=table) -->)",
     re.DOTALL,

@@ -1,4 +1,4 @@
-"""What the benchmarks share: turns, medians, and the files of rows that docs/benchmarks.md is made from.
+"""What the benchmarks share: turns, medians, and the files of rows that benchmarks/README.md is made from.
 
 A benchmark measures with `take_turns` (functions in this process) or `in_turn` (numbers that the caller measures, such
 as those of `run_process`), and writes tables with `write_rows`:
@@ -11,8 +11,8 @@ as those of `run_process`), and writes tables with `write_rows`:
     ]
     write_rows("capture_overhead", {"small": Table({"call": "call", "ms": "ms", "times": "times plain"}, rows)})
 
-`docs/benchmarks/capture_overhead.json` then holds the table with the command, date, machine and versions, and
-`python benchmarks/make_page.py` writes it between the two lines of docs/benchmarks.md that name it:
+`benchmarks/rows/capture_overhead.json` then holds the table with the command, date, machine and versions, and
+`python benchmarks/make_page.py` writes it between the two lines of benchmarks/README.md that name it:
 
     <!-- table capture_overhead/small -->
     <!-- end of capture_overhead/small -->
@@ -41,7 +41,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 #: The folder of the files of rows.
-ROWS = ROOT / "docs" / "benchmarks"
+ROWS = ROOT / "benchmarks" / "rows"
 #: The variables that say how many threads a numerical library uses.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 #: The libraries whose versions stand beside a table, where they are installed.

@@ -11,7 +11,7 @@ open store      seconds in this process for all tables with intervals of a group
 commands        seconds of whole processes: the default analysis with pictures, first without anything in the cache,
                 then again; the same without pictures; and a grouping of words, which needs the rows.
 
-Writes docs/benchmarks/regrouping.json. Two threads, in which the program works on episodes.
+Writes benchmarks/rows/regrouping.json. Two threads, in which the program works on episodes.
 """
 
 from __future__ import annotations

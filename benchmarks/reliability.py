@@ -5,7 +5,7 @@ Usage: python benchmarks/reliability.py PART [--folder FOLDER] [--share 0.1]
 PART: kill, rot, race
 
 Every part writes each case into FOLDER as it ends, and goes on where an earlier run stopped. `rows` makes the tables of
-docs/benchmarks/reliability.json from what is there. A case that shows a problem is printed, and its files stay in
+benchmarks/rows/reliability.json from what is there. A case that shows a problem is printed, and its files stay in
 FOLDER/PART. `--share` tries a part of the cases: 0.1 a tenth. Whole runs take an hour (kill), 20 minutes (rot) and ten
 minutes (race) on two cores. Kill needs root for the full disk.
 """

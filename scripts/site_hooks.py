@@ -28,7 +28,7 @@ OUTSIDE = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
-    "benchmarks/README.md": "benchmark-scripts.md",
+    "benchmarks/README.md": "benchmarks.md",
     **{f"{SCHEMAS}/{path.name}": f"schemas/{path.name}" for path in sorted((ROOT / SCHEMAS).glob("*.json"))},
 }
 _INSIDE = {there: here for here, there in OUTSIDE.items()}

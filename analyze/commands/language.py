@@ -24,7 +24,7 @@ from vla_attention.schemas.errors import plural
 from vla_attention.schemas.safe_text import visible
 
 _LISTENS = "Does it listen?"
-#: p of what is done, and q of a word that is read: three kinds of things are named (docs/benchmarks.md has the rates).
+#: p of what is done, and q of a word that is read: three kinds of things are named (rates: benchmarks/README.md).
 SHOWN_AT = NAMED_AT / 3
 #: From this share of episodes on, what was done most is said.
 _MOSTLY = 0.8

@@ -1,4 +1,4 @@
-"""`benchmarks/make_page.py`: the tables of docs/benchmarks.md are those of docs/benchmarks/*.json."""
+"""`benchmarks/make_page.py`: the tables of benchmarks/README.md are those of benchmarks/rows/*.json."""
 
 from __future__ import annotations
 

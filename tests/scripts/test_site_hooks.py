@@ -20,7 +20,7 @@ def test_links_are_those_of_the_site():
         translate_links("[a](../../README.md), [b](../store.md)", "errors/stores.md", {})
         == "[a](../index.md), [b](../store.md)"
     )
-    assert translate_links("[a](../docs/benchmarks.md)", "benchmark-scripts.md", {}) == "[a](benchmarks.md)"
+    assert translate_links("[a](../docs/store.md)", "benchmarks.md", {}) == "[a](store.md)"
 
 
 @pytest.mark.thorough
