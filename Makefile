@@ -10,7 +10,7 @@
 #   make test-numpy1 recorder, stores and analysis with numpy 1.26, in an environment of its own (.venv-numpy1)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
-#   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
+#   make notebooks   runs the notebooks of examples/ and stores what they show, in an environment of its own (.venv-notebooks)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
 #   make pictures    the pictures and printed samples of README and guides, from the run of make capture
 #   make screenshots the pictures of the viewer's page in docs/viewer.md, from the same run, in this machine's Chromium
@@ -97,7 +97,7 @@ test-policies: .venv-transformers/installed .venv-lerobot/installed
 test-remote: .venv-remote/installed
 	.venv-remote/bin/pytest --thorough tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
 
-# Executed, with their pictures, in results/notebooks.
+# Written in place: texts, tables and small pictures, without times, counters and paths of this machine.
 notebooks: .venv-notebooks/installed
 	.venv-notebooks/bin/python scripts/run_notebooks.py $(ARGS)
 

@@ -24,6 +24,8 @@ StyleName: TypeAlias = Literal["screen", "paper"]
 _ONE_COLUMN, _BOTH_COLUMNS = 3.35, 6.9
 #: Of rows of pictures on a screen, in inches.
 _WIDE = 8.4
+#: Dots per inch in a notebook, whose pages are about 900 dots wide.
+_NOTEBOOK_DPI = 100
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
     "axes.spines.top": False,
@@ -119,11 +121,20 @@ class Style:
             yield
 
     def canvas(self, width: float, height: float) -> Canvas:
-        """A matplotlib figure of width x height inches on the Agg canvas: no window system, no state of pyplot."""
+        """A matplotlib figure of width x height inches on the Agg canvas: no window system, no state of pyplot.
+
+        It shows itself in a notebook, which knows pictures of pyplot only.
+        """
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure as Canvas
 
-        canvas = Canvas(figsize=(width, height), dpi=self.dpi)
+        class Shown(Canvas):
+            def _repr_png_(self) -> bytes:
+                file = BytesIO()
+                self.savefig(file, format="png", dpi=_NOTEBOOK_DPI)
+                return file.getvalue()
+
+        canvas = Shown(figsize=(width, height), dpi=self.dpi)
         FigureCanvasAgg(canvas)
         return canvas
 

@@ -86,6 +86,7 @@ def test_an_answer_shows_saves_and_draws_itself(run, tmp_path):
     assert str(answer).splitlines()[0] == answer.about[0]
     assert "<table" in answer._repr_html_()
     assert answer.plot().get_axes()
+    assert answer.plot()._repr_png_().startswith(b"\x89PNG")
     assert {"result.json", "words.csv", "word_bars.png"} <= {file.name for file in answer.save(tmp_path, csv=True)}
     with pytest.raises(va.UserError, match="word_bars"):
         answer.plot("word_bar")
