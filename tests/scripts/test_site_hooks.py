@@ -15,7 +15,7 @@ def test_links_are_those_of_the_site():
     assert translate_links("[a](docs/store.md#codecs) ![b](docs/pictures/sink.png)", "index.md", {}) == (
         "[a](store.md#codecs) ![b](pictures/sink.png)"
     )
-    assert translate_links("[a](../CONTRIBUTING.md#checks)", "store.md", {}) == "[a](contributing.md#checks)"
+    assert translate_links("[a](../CONTRIBUTING.md#the-gate)", "store.md", {}) == "[a](contributing.md#the-gate)"
     assert (
         translate_links("[a](../../README.md), [b](../store.md)", "errors/stores.md", {})
         == "[a](../index.md), [b](../store.md)"
