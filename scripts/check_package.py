@@ -42,6 +42,7 @@ TOP_OF_SDIST = {
     "MANIFEST.in",
     "PKG-INFO",
     "README.md",
+    "examples",
     "pyproject.toml",
     "setup.cfg",
 }
