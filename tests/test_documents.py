@@ -24,7 +24,7 @@ from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
 from vla_attention.capture.commands.arguments import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [path for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))) if path.is_file()]
+DOCUMENTS = [*ROOT.glob("*.md"), ROOT / "benchmarks" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: Folders at the top of the checkout: a path in backticks that begins with one of these must exist.
 TOP_FOLDERS = sorted(path.name for path in ROOT.iterdir() if path.is_dir() and not path.name.startswith("."))
 #: Folders that runs make.
