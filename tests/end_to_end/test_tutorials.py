@@ -53,9 +53,9 @@ def run_blocks(text: str, page: str) -> int:
 
 @pytest.mark.thorough
 @pytest.mark.simulator
-def test_your_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
+def test_my_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert walk("your-checkpoint.md") == 8
+    assert walk("my-checkpoint.md") == 6
     assert "touch the red cube" in capsys.readouterr().out
     assert Path("results/runs/mine/report/report.html").stat().st_size > 10_000
     # The walk begins with what `make capture` makes, of which the first episode is the one of the walk before.
