@@ -67,12 +67,12 @@ def test_my_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.thorough
-def test_your_robots_data(tmp_path, monkeypatch, capsys):
+def test_my_data_set(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     cameras = ("observation.images.front", "observation.images.wrist")
     episodes = made_up_episodes((12, 9, 7), cameras=cameras)
     write_data_set(tmp_path / "data" / "so101_pick", "v3.0", episodes, video=H264)
-    assert walk("your-robot.md") == 9
+    assert walk("my-data-set.md") == 8
     assert "standard deviations of the data set's actions" in " ".join(capsys.readouterr().out.split())
 
 
