@@ -1,4 +1,4 @@
-"""Every sentence that docs/commands.md quotes is printed somewhere: its fixed parts stand in one text of the sources."""
+"""Every sentence that docs/commands.md quotes is printed somewhere: its fixed parts are in one text of the sources."""
 
 from __future__ import annotations
 
