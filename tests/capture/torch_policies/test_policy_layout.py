@@ -126,8 +126,8 @@ def test_a_wrong_kind_or_role_shows_all_that_there_are_and_which_fit_together(ki
 
 
 def test_the_guide_has_every_kind_with_its_roles():
-    guide = (ROOT / "docs" / "your-policy.md").read_text(encoding="utf-8")
-    table = guide.split("| kind | roles of its keys |")[1].split("\n\n")[0]
+    guide = (ROOT / "docs" / "my-policy.md").read_text(encoding="utf-8")
+    table = guide.split("| kind | roles |")[1].split("\n\n")[0]
     rows = [re.findall(r"`(\w+)`", "|".join(row.split("|")[1:3])) for row in table.splitlines()[2:]]
     assert {kind: roles for kind, *roles in rows} == {
         kind: [role.label for role in roles] for kind, roles in ROLES_OF_KIND.items()
