@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,8 +29,9 @@ def language_test(
     """Call a policy with other sentences on the same inputs; prints and returns how far its actions change.
 
     Nothing is recorded, and neither torch nor a simulator is needed. A change is the root mean square over a chunk, in
-    units of how far each dimension of the action spreads over all inputs. Beside it stands the change when the same
-    sentence is given again, which is that of the policy's own noise: draw it anew in every call, as in a rollout.
+    units of how far each dimension of the action spreads over all inputs, or, for a dimension in which the inputs do not
+    differ, of its root mean square change over all calls. Beside it stands the change when the same sentence is given again, which is that of the policy's
+    own noise: draw it anew in every call, as in a rollout.
 
     >>> import numpy as np
     >>> import vla_attention as va
@@ -62,21 +63,21 @@ def language_test(
     plain = [_actions(call(*given)) for given in inputs]
     if len({actions.shape for actions in plain}) > 1:
         raise BadArgument(f"The calls gave actions of the shapes {sorted({one.shape for one in plain})}; expected one.")
+    rows: list[dict[str, Any]] = []
+    changes = []
+    for number, ((observation, own), actions) in enumerate(zip(inputs, plain, strict=True)):
+        for kind, text in [(_AGAIN, own), *((kind, text) for kind, text in texts if text != own)]:
+            made = _actions(call(observation, text))
+            if made.shape != actions.shape:
+                raise BadArgument(f"Told '{text}', the actions have the shape {made.shape}, not {actions.shape}.")
+            rows.append({"suite": "", "task_id": number, "instruction": own, "kind": kind, "told": text})
+            changes.append(made - actions)
     spread = np.concatenate(plain).std(axis=0)
+    spread = np.where(spread > 0, spread, np.sqrt(np.mean(np.square(changes), axis=(0, 1))))
     if not spread.any():
-        raise BadArgument("All actions of all inputs are the same: give inputs at which it does something else.")
-
-    def rows() -> Iterator[dict[str, Any]]:
-        for number, ((observation, own), actions) in enumerate(zip(inputs, plain, strict=True)):
-            for kind, text in [(_AGAIN, own), *((kind, text) for kind, text in texts if text != own)]:
-                made = _actions(call(observation, text))
-                if made.shape != actions.shape:
-                    raise BadArgument(f"Told '{text}', the actions have the shape {made.shape}, not {actions.shape}.")
-                change = (made - actions)[:, spread > 0] / spread[spread > 0]
-                size = float(np.sqrt(np.mean(change**2)))
-                yield {"suite": "", "task_id": number, "instruction": own, "kind": kind, "told": text, "change": size}
-
-    told = pl.DataFrame([*rows()])
+        raise BadArgument("All actions of all calls are the same: give inputs at which it does something else.")
+    sizes = np.sqrt(np.mean((np.array(changes)[..., spread > 0] / spread[spread > 0]) ** 2, axis=(1, 2)))
+    told = pl.DataFrame(rows).with_columns(change=pl.Series(sizes))
     again = told.filter(kind=_AGAIN).select("task_id", again="change")
     each = told.join(again, on="task_id", how="left", maintain_order="left")
     per_input = each.group_by("suite", "task_id", "kind", maintain_order=True).agg(pl.mean("change", "again"))

@@ -173,16 +173,18 @@ def _finding(question: Question, classes: pl.DataFrame, by: Collection[str]) -> 
                        enough(question), step)  # fmt: skip
     row = of_interest.row(0, named=True)
     numbers = {name: row[name] for name in row if name.startswith(("share", "enrichment", "over_place", "num_"))}
-    gets = f"{row['share']:.1%} of the attention to the pictures, {_times(row, 'enrichment')} what its area would give"
+    gets = f"{row['share']:.1%} of the attention to the pictures"
     if row["over_place"] is None:
         limit = "No task has two episodes: whether it is for the object or for its place cannot be told."
-        return Finding(f"What the instruction names gets {gets}.", _ASKS, numbers, limit, step)
-    place = f"and {_times(row, 'over_place')} what its place would explain"
+        area = f"{_times(row, 'enrichment')} what its area would give"
+        return Finding(f"What the instruction names gets {gets}, {area}.", _ASKS, numbers, limit, step)
     low = row["over_place_low"]
     verdict = "What the instruction names: it gets"
     if not question.untrained and (low is None or low <= 1):
         verdict = "It is not shown to look for what the instruction names, which gets"
-    return Finding(f"{verdict} {gets}, {place}.", _ASKS, numbers, enough(question), step)
+    said = f"{verdict} {_times(row, 'over_place')} the attention that its place would explain"
+    return Finding(f"{said} ({gets}; {row['enrichment']:.2g} times its share of the area).", _ASKS, numbers,
+                   enough(question), step)  # fmt: skip
 
 
 def _times(row: dict[str, Any], name: str) -> str:

@@ -86,7 +86,7 @@ _BARS = {
     "colors": {"content": "#0072B2", "stop": "#E69F00", "scale": "#9A9A9A"},
     "names": {"content": "content word", "stop": "stop word", "scale": "for scale"},
     "baseline": 1.0,
-    "baseline_name": "evenly spread",
+    "baseline_name": "if spread evenly",
     "log": True,
     "xlabel": "attention per token, evenly spread = 1 (logarithmic)",
 }

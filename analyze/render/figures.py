@@ -57,8 +57,8 @@ _MOST_ROWS = 60
 _MOST_DOTS = 300
 #: More labels than this along an axis would touch.
 _MOST_LABELS = 24
-#: What the line that evenly spread attention gives is called.
-BASELINE_NAME = "evenly spread attention"
+#: What the line of attention without a preference is called, in every picture.
+BASELINE_NAME = "if spread evenly"
 
 _FOR_LATEX = str.maketrans({
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",

@@ -48,6 +48,14 @@ def test_a_deaf_policy_and_a_noisy_one():
     assert "times" in noisy.findings[0].numbers  # whether words get through is not said of what noise does as well
 
 
+def test_a_dimension_that_only_the_words_move():
+    found = va.language_test(lambda place, told: [[place, "right" in told]], INPUTS, KINDS)
+    rows = {row["kind"]: row["change"] for row in found["sentences"].iter_rows(named=True)}
+    assert rows["paraphrased"] == 0
+    changes = np.array([0] * 18 + [1] * 6)  # the same again and two paraphrases, the opposite
+    assert rows["opposite"] == pytest.approx(np.sqrt(1 / np.mean(changes**2) / 2))
+
+
 @pytest.mark.parametrize(
     ("call", "inputs", "prompts"),
     [
