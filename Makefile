@@ -13,7 +13,7 @@
 #   make notebooks   runs the notebooks of examples/ and stores what they show, in an environment of its own (.venv-notebooks)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
 #   make pictures    the pictures and printed samples of README and guides, from the run of make capture
-#   make screenshots the pictures of the viewer's page in docs/viewer.md, from the same run, in this machine's Chromium
+#   make screenshots the pictures of the viewer's page in docs/page.md, from the same run, in this machine's Chromium
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #

@@ -29,9 +29,9 @@ def language_test(
     """Call a policy with other sentences on the same inputs; prints and returns how far its actions change.
 
     Nothing is recorded, and neither torch nor a simulator is needed. A change is the root mean square over a chunk, in
-    units of how far each dimension of the action spreads over all inputs, or, for a dimension in which the inputs do not
-    differ, of its root mean square change over all calls. Beside it stands the change when the same sentence is given again, which is that of the policy's
-    own noise: draw it anew in every call, as in a rollout.
+    units of how far each dimension of the action spreads over all inputs, or, for a dimension in which the inputs do
+    not differ, of its root mean square change over all calls. Beside it stands the change when the same sentence is
+    given again, which is that of the policy's own noise: draw it anew in every call, as in a rollout.
 
     >>> import numpy as np
     >>> import vla_attention as va

@@ -7,7 +7,7 @@ listed by commands in processes of their own; the times are with Python's start 
 
 `parts`: of a store in the shape of pi0.5 in LIBERO (`--store`, written when it is not there), the processor seconds
 that one episode costs the process that asks and the one that works, and the bytes that travel between them.
-docs/scale.md computes with them. Everything runs on one thread.
+docs/my-cluster.md computes with them. Everything runs on one thread.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Interventions: what a run changes in the policy's attention, prompt, pictures or noise.
 
-They are settings, stored in the root attributes of a store and part of the run's configuration. `docs/interventions.md`
+They are settings, stored in the root attributes of a store and part of the run's configuration. `docs/effects.md`
 has the formulas; the arithmetic is in `capture/interventions/`. Groups of keys are named in the grouping language.
 """
 

@@ -82,7 +82,7 @@ ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
 
 
 def kinds_and_roles() -> str:
-    """Every kind of span with the roles that its keys can have, for messages; docs/your-policy.md has it, too."""
+    """Every kind of span with the roles that its keys can have, for messages; docs/my-policy.md has it, too."""
     kinds = [f"{kind} ({', '.join(role.label for role in roles)})" for kind, roles in ROLES_OF_KIND.items()]
     return f"Kinds of spans, with the roles that their keys can have: {', '.join(kinds)}"
 

@@ -3,7 +3,7 @@
 It differs from the published scripts' files in four points: a ratio that is not finite is null (they write Infinity,
 which is not JSON), summaries count such ratios in `num_nonfinite`, a summary over no finite ratio is null (they write
 0.0), and steps and episodes have fields that theirs lack: what the fractions are of and how many keys each side has
-(which the published guide tells its readers to look at), and what the numbers are about. docs/published-numbers.md
+(which the published guide tells its readers to look at), and what the numbers are about. docs/reading.md
 describes all of it.
 """
 

@@ -1,4 +1,4 @@
-"""Draw the pictures of README.md and of `docs/interpreting.md`, with the tool's own commands.
+"""Draw the pictures of README.md and of `docs/reading.md`, with the tool's own commands.
 
 Usage: python scripts/make_pictures.py [--run runs/cubes.zarr] [--folder docs/pictures]
 

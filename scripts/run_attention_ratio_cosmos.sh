@@ -9,7 +9,7 @@
 #   bash scripts/run_attention_ratio_cosmos.sh                    without SLURM
 #
 # After an interruption or the time limit, run the same line again: it continues with the missing episodes.
-# A job that SLURM warns with SIGTERM drops the episode in progress and requeues itself. See docs/cluster.md.
+# A job that SLURM warns with SIGTERM drops the episode in progress and requeues itself. See docs/my-cluster.md.
 #
 # Environment variables; one that is empty counts as not set.
 # What is run

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
+import subprocess
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -144,6 +145,21 @@ def test_the_site_has_every_page_once():
             for part in entry.values() if isinstance(entry, dict) else entry:
                 yield from pages(part)
 
-    listed = list(pages(yaml.safe_load(text_of(ROOT / "scripts/mkdocs.yml"))["nav"]))
+    site = yaml.safe_load(text_of(ROOT / "scripts/mkdocs.yml"))
+    listed = [*pages(site["nav"]), *site["not_in_nav"].split()]
     written = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
     assert sorted(listed) == sorted([*written, *(page for page in OUTSIDE.values() if page.endswith(".md"))])
+
+
+def test_the_program_names_pages_that_exist():
+    """In error sentences, help texts, docstrings, notebooks and the page."""
+    kinds = {".py", ".ipynb", ".html", ".ts", ".tsx", ".sh", ".yml", ".json", ".toml"}
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    named = {
+        (file, page)
+        for file in tracked
+        if Path(file).suffix in kinds and not file.startswith("tests/") and (ROOT / file).is_file()
+        for page in re.findall(r"\b(?:docs|benchmarks|examples)/[\w./-]*\.md\b", text_of(ROOT / file))
+    }
+    assert len(named) > 30
+    assert [(file, page) for file, page in sorted(named) if not (ROOT / page).is_file()] == []

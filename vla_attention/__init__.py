@@ -5,7 +5,7 @@
     run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one; or va.example("cubes")
     run.analyze()["tasks"]                  # a polars frame; docs/python.md lists the other methods
 
-    with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
+    with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/my-policy.md
         ...
 
 Public names: `open`, `example`, `workers`, `OpenStores` and `language_test` (stage two); `record`, `inspect`,
@@ -103,7 +103,7 @@ def example(name: str) -> Path:
 def workers(where: int | str) -> AbstractContextManager[None]:
     """Return a block within which episodes are worked on elsewhere; results are the same to the last bit.
 
-    `where`: a number of processes on this machine, or the address of a running dask scheduler (docs/cluster.md). The
+    `where`: a number of processes on this machine, or the address of a running dask scheduler (docs/my-cluster.md). The
     processes do not run a script again that has no `if __name__ == "__main__":`.
 
     >>> with va.workers(2):

@@ -10,7 +10,7 @@
         frame.instruction, frame.seconds, frame.index
 
 `vla-capture replay` records policy calls on such frames; `ReplayPolicy` is what its `--policy FILE.py` returns.
-docs/data-sets.md describes both.
+docs/my-data-set.md describes both.
 """
 
 from __future__ import annotations

@@ -252,7 +252,7 @@ def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
     except (OSError, ValueError, TypeError) as error:
         raise BadArgument(
             f"No scheduler answers at '{address}' ({str(error) or type(error).__name__}); expected the address of a "
-            "running dask scheduler, as tcp://HOST:8786: start one with `dask scheduler` (docs/cluster.md)."
+            "running dask scheduler, as tcp://HOST:8786: start one with `dask scheduler` (docs/my-cluster.md)."
         ) from None
     try:
         others = {str(one) for one in client.run(_package_version).values()} - {_package_version()}

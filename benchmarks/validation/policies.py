@@ -13,28 +13,27 @@ from vla_attention.schemas.stores.reader import Store, open_store
 
 #: The suite in which each control was trained (`examples/cubes_policy/dataset.py`).
 SUITES = {"words": "cubes", "redundant": "cubes_marked", "mark": "cubes_mark_only", "no-wrist": "cubes"}
-#: In place of a control: the policy of questions 2 and 3, which was trained longer and on more tasks.
+#: In place of a control: `pi05_cubes`, which was trained longer and on more tasks.
 SHIPPED = "shipped"
-#: How pages and pictures call the controls.
+#: What the page calls the controls.
 TITLES = {
+    SHIPPED: "shipped",
     "words": "must read",
     "redundant": "need not read",
     "mark": "cannot read",
     "no-wrist": "no wrist camera",
-    SHIPPED: "shipped",
 }
 
 
 @dataclass(frozen=True)
 class KnownPolicy:
-    """A trained policy. control: what it could learn from; empty for a checkpoint of which nothing is known."""
+    """A trained policy. control: what it could learn from, one of `TITLES`."""
 
     name: str
     checkpoint: str
     suite: str
-    control: str = ""
+    control: str
     seed: int = 0
-    family: str = "pi"
 
 
 def read_policies(folder: Path) -> list[KnownPolicy]:
@@ -52,17 +51,11 @@ def read_policies(folder: Path) -> list[KnownPolicy]:
     return sorted(found, key=lambda policy: (list(SUITES).index(policy.control), policy.seed))
 
 
-def record(
-    policy: KnownPolicy, store: Path, tasks: list[int] | None, episodes: int, max_steps: int | None, *further: str
-) -> Store:
-    """Record rollouts of a policy, or go on with them, and open the store."""
-    arguments = [policy.family, "--checkpoint", policy.checkpoint, "--task-suite", policy.suite, "--output", str(store)]
-    arguments += ["--num-episodes", str(episodes), "--threads", "1"]
-    if tasks is not None:
-        arguments += ["--task-id", *map(str, tasks)]
-    if max_steps is not None:
-        arguments += ["--max-steps", str(max_steps)]
-    arguments += ["--resume"] if store.exists() else []
+def record(policy: KnownPolicy, store: Path, tasks: list[int], max_steps: int, *further: str) -> Store:
+    """Record a rollout of each task, or go on with them, and open the store."""
+    arguments = ["pi", "--checkpoint", policy.checkpoint, "--task-suite", policy.suite, "--output", str(store)]
+    arguments += ["--num-episodes", "1", "--threads", "1", "--max-steps", str(max_steps)]
+    arguments += ["--task", *map(str, tasks), *(["--resume"] if store.exists() else [])]
     if capture([*arguments, *further]):
         raise SystemExit(f"the capture into {store} failed")
     return open_store(store)

@@ -1,57 +1,79 @@
-"""Means over episodes with the house's intervals: the task is the unit, as if no two tasks were related."""
+"""The tables of `docs/validation.md`, written between marks from the file of results."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-import polars as pl
+from benchmarks.validation.numbers import NUMBERS
+from benchmarks.validation.policies import TITLES
+from benchmarks.validation.ranks import FAMILIES
+from vla_attention.analyze.render.numbers import format_number
+from vla_attention.schemas.errors import BadArgument
 
-from vla_attention.analyze.core.estimate import estimate
-from vla_attention.analyze.statistics.units import Sampling
-
-#: Scale on which a number is averaged and compared, and the way back.
-SCALES = {"log": (np.log, np.exp), "plain": (lambda x: x, lambda x: x)}
-
-
-def means(table: pl.DataFrame, by: Sequence[str], value: str = "value", scale: str = "plain") -> list[dict[str, Any]]:
-    """Rows with `by`, value, low, high and the number of episodes and tasks.
-
-    table: one row per episode and item, with suite and task_id. With one task or without spread, low and high are None.
-    """
-    into, back = SCALES[scale]
-    values = table[value].to_numpy().astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        transformed = into(values)
-    there = np.isfinite(transformed)
-    chosen = table.with_columns(pl.Series(value, transformed)).filter(pl.Series(there))
-    if not chosen.height:
-        return []
-    found = estimate(chosen, by, {value: "plain"}, Sampling())
-    rows = []
-    for row in found.iter_rows(named=True):
-        numbers = {
-            "value" if end == "" else end[1:]: None
-            if row[f"{value}{end}"] is None
-            else float(back(row[f"{value}{end}"]))
-            for end in ("", "_low", "_high")
-        }
-        rows.append({name: row[name] for name in (*by, "num_episodes", "num_tasks")} | numbers)
-    return rows
+Results = Mapping[str, Any]
 
 
-def ranks(values: np.ndarray) -> np.ndarray:
-    """Ranks from 1; equal values share their mean rank."""
-    return pl.Series(values).rank("average").to_numpy()
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table."""
+    lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
 
 
-def spearman(first: np.ndarray, second: np.ndarray) -> float:
-    """Rank correlation (Spearman 1904); NaN where one of them has no spread or fewer than four items are known."""
-    there = np.isfinite(first) & np.isfinite(second)
-    if there.sum() < 4:
-        return float("nan")
-    one, other = ranks(first[there]), ranks(second[there])
-    if one.std() == 0 or other.std() == 0:
-        return float("nan")
-    return float(np.corrcoef(one, other)[0, 1])
+def numbers_table(results: Results) -> str:
+    """A row for each number, a column for each kind of policy, a value for each training."""
+    kinds = [kind for kind in TITLES if any(policy["control"] == kind for policy in results["policies"])]
+
+    def cell(kind: str, name: str) -> str:
+        own = [policy["numbers"] for policy in results["policies"] if policy["control"] == kind]
+        return ", ".join(format_number(of[name]) for of in own if name in of) or "-"
+
+    solved = [
+        ", ".join(f"{policy['solved']}" for policy in results["policies"] if policy["control"] == kind)
+        for kind in kinds
+    ]
+    rows = [("solved, of 12", *solved)]
+    rows += [(title, *(cell(kind, name) for kind in kinds)) for name, title in NUMBERS.items()]
+    return markdown(("", *(TITLES[kind] for kind in kinds)), rows)
+
+
+def ranks_table(results: Results) -> str:
+    """A row for each family of groups: with which rank correlation attention foretells the effect."""
+    of = {(row["family"], row["queries"]): row for row in results["ranks"]}
+
+    def cell(family: str, queries: str) -> str:
+        row = of[family, queries]
+        interval = "" if row["low"] is None else f" [{row['low']:.2f}, {row['high']:.2f}]"
+        return f"{row['value']:.2f}{interval}"
+
+    rows = (
+        (what, f"{of[family, 'all']['items']:.0f}", cell(family, "action"), cell(family, "all"))
+        for family, (what, _) in FAMILIES.items()
+    )
+    return markdown(("groups", "number", "hidden from the action tokens", "hidden from all tokens"), rows)
+
+
+def success_table(results: Results) -> str:
+    """Rollouts under each condition."""
+    rows = (
+        (TITLES[row["control"]], row["condition"], f"{row['solved']} of {row['episodes']}")
+        for row in results["success"]
+    )
+    return markdown(("policy", "changed", "solved"), rows)
+
+
+def fill_page(page: Path, results: Results) -> None:
+    """Replace what stands between the marks `<!-- NAME -->` and `<!-- end NAME -->`."""
+    text = page.read_text(encoding="utf-8")
+    for name, block in (
+        ("numbers", numbers_table(results)),
+        ("ranks", ranks_table(results)),
+        ("success", success_table(results)),
+    ):
+        begin, end = f"<!-- {name} -->", f"<!-- end {name} -->"
+        if begin not in text or end not in text:
+            raise BadArgument(f"{page} has no marks '{begin}' and '{end}' to write the table between.")
+        head, rest = text.split(begin, 1)
+        text = f"{head}{begin}\n\n{block}\n\n{end}{rest.split(end, 1)[1]}"
+    page.write_text(text, encoding="utf-8")

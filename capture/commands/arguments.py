@@ -75,7 +75,7 @@ class ClusterSettings:
     stage: Literal["capture", "analyze", "both"] | None = option(
         "what to do (default: both; in an array job capture, as all of its tasks fill one store)",
         None,
-        group="as a job of a cluster (see docs/cluster.md)",
+        group="as a job of a cluster (see docs/my-cluster.md)",
     )
     array_index: int | None = option(
         "index in an array job: a task, counted through the suites of 'all'", None, least=0
@@ -236,7 +236,7 @@ _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser, Seq
     "replay": (
         "make policy calls on the frames of a data set of a robot",
         "Feed the pictures, states and tasks of a LeRobotDataset (2.0, 2.1 or 3.0) to a policy, without a simulator, "
-        "and record its attention into a store like any other, beside the data set's actions. See docs/data-sets.md.",
+        "and record its attention into a store like any other, beside the data set's actions. See docs/my-data-set.md.",
         REPLAY_EXAMPLES,
         add_replay_arguments,
     ),

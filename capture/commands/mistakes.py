@@ -22,7 +22,7 @@ def refuse_other_tools_words(words: Sequence[str]) -> None:
         raise BadArgument(
             f"There is no command '{words[0]}': a policy that no family knows is recorded from your own code, "
             "with va.record, or over a data set, with vla-attention capture replay DATASET --policy FILE.py "
-            "(docs/your-policy.md)."
+            "(docs/my-policy.md)."
         )
     named = [word.partition("=")[0] for word in words]
     if first not in ("replay", "doctor", "tasks") and "--episodes" in named:

@@ -52,7 +52,10 @@ def _changed(caller: Caller, call: PolicyCall, made: RecordedCall) -> Plumbing:
     other, exchanged, why_not = _exchanged(caller, given)
     if exchanged is None:
         return structs.replace(found, why_not=why_not)
-    (again,) = caller.make([replace(call, policy_input=exchanged)])
+    try:
+        (again,) = caller.make([replace(call, policy_input=exchanged)])
+    except UserError as error:  # words that the run knocks out are not in the other sentence
+        return structs.replace(found, why_not=f"the call with '{other}' cannot be made: {error}")
     if not isinstance(again, RecordedCall):
         return structs.replace(found, why_not=f"the call with '{other}' gave numbers that are not finite")
     units = policy.action_units() if isinstance(policy, UnitsPolicy) else np.ones(made.actions.shape[-1])
@@ -97,6 +100,9 @@ def _row_of_another(caller: Caller, calls: Sequence[PolicyCall], made: Sequence[
         return None
     call = calls[place]
     mixed = caller.policy.prepare_again(replace(call.policy_input.given, instruction=first))
-    ways = [caller.make([one])[0] for one in (call, replace(call, policy_input=mixed))]
+    try:
+        ways = [caller.make([one])[0] for one in (call, replace(call, policy_input=mixed))]
+    except UserError:  # as in `_changed`
+        return None
     away = [np.abs(way.actions - made[place].actions).max() for way in ways if isinstance(way, RecordedCall)]
     return None if len(away) < len(ways) or away[0] == away[1] else bool(away[1] < away[0])

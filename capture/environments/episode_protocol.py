@@ -1,7 +1,7 @@
 """The published LIBERO evaluations: the numbers that are the same in all of them, and those in which they differ.
 
 Sources: `examples/libero/main.py` of openpi, `envs/libero.py` and `scripts/lerobot_eval.py` of LeRobot. A policy family
-with an evaluation of its own has its `EvaluationProtocol` in its folder. `docs/protocol.md` has them in a table.
+with an evaluation of its own has its `EvaluationProtocol` in its folder. `docs/my-checkpoint.md` has them in a table.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class InterventionSettings:
         "keys that are not read: camera:NAME, word:NAME, object:NAME, role:NAME ..., joined by &, | and - as in "
         "groupings; may be given several times",
         (),
-        group="interventions: what is changed in the policy, stored with the run (docs/interventions.md)",
+        group="interventions: what is changed in the policy, stored with the run (docs/effects.md)",
         action="append",
         metavar="SELECTOR",
     )

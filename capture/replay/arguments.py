@@ -96,7 +96,7 @@ def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) 
         default=families[0].name,
         metavar="NAME|FILE.py",
         help=f"{listing(family.name for family in families)}, or a file with a function load(device) that returns any "
-        "torch policy as a va.datasets.ReplayPolicy, see docs/data-sets.md (default: %(default)s)",
+        "torch policy as a va.datasets.ReplayPolicy, see docs/my-data-set.md (default: %(default)s)",
     )
     place = "the store, NAME.zarr, or a folder for it (default: runs/DATASET.zarr)"
     if is_policy_file(_policy_among(given)):

@@ -25,7 +25,7 @@ class ReplayPolicy:
 
     Attributes:
         policy: an `nn.Module`, or an object that has modules as attributes.
-        layout: what its attention calls are (`va.layouts`, docs/your-policy.md).
+        layout: what its attention calls are (`va.layouts`, docs/my-policy.md).
         act: a frame of the data set -> the actions (horizon, action_dim), or None where they are not to be stored. It
             calls the policy once. A policy that answers from a queue has to be asked for a whole chunk, or reset
             before. torch's random numbers are seeded before every call.

@@ -93,7 +93,7 @@ def _family_of(root: RootAttributes) -> PolicyFamily:
         raise BadArgument(
             f"Cannot rerun a store of '{root.policy.family}', a policy of the caller's own code, which vla-capture "
             "cannot load; use vla-attention capture replay DATASET --policy FILE.py --knockout SELECTOR --rerun-of "
-            "STORE, or va.record(..., interventions=va.knockout(SELECTOR)) (docs/your-policy.md)."
+            "STORE, or va.record(..., interventions=va.knockout(SELECTOR)) (docs/my-policy.md)."
         ) from None
 
 

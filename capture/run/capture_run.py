@@ -197,7 +197,7 @@ def _lines_on_source(identity: PolicyIdentity, protocol: Protocol) -> list[str]:
         lines.append(f"WARNING: {identity.checkpoint} was trained on {listing(trained_on)}; {unlike}")
     return [
         *lines,
-        f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
+        f"Protocol: {protocol.name} (docs/my-checkpoint.md), seed {protocol.seed}, pictures of {protocol.image_size} "
         f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them.",
         f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.",
     ]

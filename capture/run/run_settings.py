@@ -52,8 +52,8 @@ class RunSettings:
     task_ids: tuple[int, ...] | None = task_option("tasks of the suite")
     num_episodes: int = option("episodes per task (default: %(default)s)", 5, least=1)
     protocol: EvaluationProtocol | None = option(
-        "the published evaluation to follow: picture size, steps and seeding, see docs/protocol.md (default: that of "
-        "the checkpoint's format)",
+        "the published evaluation to follow: picture size, steps and seeding, see docs/my-checkpoint.md (default: "
+        "that of the checkpoint's format)",
         None,
         type=str,
     )

@@ -86,7 +86,7 @@ def record(
     Args:
         store: the store to write, `NAME.zarr`.
         policy: an `nn.Module`, or an object that has modules as attributes.
-        layout: what its attention calls are (`va.layouts`, or docs/your-policy.md).
+        layout: what its attention calls are (`va.layouts`, or docs/my-policy.md).
         suite: your name for the tasks.
         checkpoint: where the weights come from, for the store.
         tokenizer: the policy's own; with it the prompt's tokens have words. None: the layout's text, if it has none.
@@ -95,11 +95,11 @@ def record(
         queries: `mean` over the action queries, or `all` of them.
         bits: precision of the stored rows in mantissa bits; 23 is exact.
         contributions: also what each part of the keys adds to the residual stream, gates and norms included
-            (docs/your-policy.md, "Contributions"). It is an error at a policy call that does not show it.
+            (docs/my-policy.md, "Contributions"). It is an error at a policy call that does not show it.
         frames: store the pictures that replans are given.
         effects: what is taken away from each call, one at a time, to see how the action changes: `text`, `cameras`,
             `objects`, `tokens`, with commas between, or `EffectSettings`. Each replan then needs `repeat`
-            (docs/your-policy.md, "Effects").
+            (docs/my-policy.md, "Effects").
         interventions: what is changed in the attention of the action queries, as `va.knockout("word:bowl")` says it.
         allow_empty: leave a replan unchanged where a group of them has no key.
         own_setting: a policy call that can be repeated, `lambda: policy.select_action(batch)`: it is made once as you

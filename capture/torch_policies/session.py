@@ -260,7 +260,7 @@ class RecordedRun:
             raise ContributionsUnknown(
                 "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
                 f"residual stream: {unknown}{of_batch}. Record with contributions=False, or --no-contributions "
-                '(docs/your-policy.md, "Contributions"). Nothing of this episode was kept.'
+                '(docs/my-policy.md, "Contributions"). Nothing of this episode was kept.'
             )
 
 

@@ -115,7 +115,7 @@ def reference(vocabulary: Vocabulary, text_keys: int | None = None) -> Grouping:
     The groups are not what their names say. pi: "visual" is the first camera, "linguistic" the next `text_keys` keys
     (those of the next camera, at 256 its patches exactly), "action" all the rest. A range that reaches beyond the last
     key ends there, as the scripts' slices do. Cosmos: frame `curr_last` over frame `frame0`, a blank picture. The
-    scripts' queries differ too: docs/published-numbers.md.
+    scripts' queries differ too: docs/reading.md.
 
     Args:
         vocabulary: the names in the stores.

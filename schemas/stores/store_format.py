@@ -184,7 +184,7 @@ class Protocol(Document, frozen=True):
     """How episodes are run. It is the same for all episodes of a run.
 
     `name` is the published evaluation that is followed (openpi, lerobot or cosmos): it decides how resets are seeded.
-    `image_size` is the height and width of the simulator's pictures in pixels. `docs/protocol.md` has the details.
+    `image_size` is the height and width of the simulator's pictures in pixels. `docs/my-checkpoint.md` has the details.
 
     Runs without a simulator of ours have the name `recorded` (the caller's own loop) or `dataset` (a replayed data
     set); `suite` is the caller's name for the tasks, and a number that is not known is 0.

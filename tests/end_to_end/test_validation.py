@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +13,18 @@ import benchmarks.validation.calls as validation_calls
 from benchmarks.validation.__main__ import main
 from benchmarks.validation.calls import changed_episodes, units_of
 from benchmarks.validation.changes import without
-from benchmarks.validation.page import blocks
+from benchmarks.validation.numbers import NUMBERS
 from benchmarks.validation.policies import load_policy
-from benchmarks.validation.tables import spearman
+from benchmarks.validation.ranks import FAMILIES, spearman
+from benchmarks.validation.tables import fill_page
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from tests.kit.questions import question_about
 from tests.kit.reruns import write_base
 from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import open_store
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def quiet(line: str) -> None:
@@ -67,14 +72,19 @@ def work(tmp_path_factory):
 
 @pytest.mark.simulator
 @pytest.mark.thorough
-def test_the_reduced_run_has_every_table_and_unchanged_calls_are_the_stored_ones(work):
+def test_the_reduced_run_has_every_table_and_unchanged_calls_are_the_stored_ones(work, tmp_path):
     results = json.loads((work / "results.json").read_text())
-    names = {"policies", "words/redundant", "other", "mixing", "readers", "success"}
-    names |= {"prediction", "prediction everywhere"}
-    assert set(blocks(results)) == names
-    assert [policy["rerun_difference"] for policy in results["policies"]] == [0.0, 0.0]
-    assert {row["family"] for row in results["prediction"]} >= {"groups", "regions", "tokens", "heads, text"}
-    assert len(list(work.glob("validation_*.png"))) == 3
+    assert [policy["control"] for policy in results["policies"]] == ["shipped", "words", "redundant"]
+    assert {policy["rerun_difference"] for policy in results["policies"]} == {0.0}
+    without_mark = set(NUMBERS) - {"mark", "mark_filled"}
+    found = [set(policy["numbers"]) for policy in results["policies"]]
+    assert found == [without_mark, without_mark, set(NUMBERS)]
+    assert {row["family"] for row in results["ranks"]} == set(FAMILIES)
+    assert {row["policy"] for row in results["success"]} == {"shipped", "words_0", "redundant_0"}
+    page = tmp_path / "page.md"
+    shutil.copy(ROOT / "docs" / "validation.md", page)
+    fill_page(page, results)
+    assert len(page.read_text().splitlines()) > 100
 
 
 @pytest.mark.simulator
@@ -87,7 +97,7 @@ def test_effects_are_those_that_a_rerun_records(work, tmp_path):
     assert found is not None
     table = found.episodes().filter(condition="without_instruction")
     policy = load_policy(base.path)
-    changes = {"words": without("role:instruction")}
+    changes = {"words": without("role:instruction", "action")}
     ours = changed_episodes(policy, base, lambda episode: changes, 99, tmp_path / "calls", quiet)
     expected = {row["task_id"]: row["effect"] for row in table.iter_rows(named=True)}
     for episode in ours:

@@ -16,10 +16,7 @@ def test_links_are_those_of_the_site():
         "[a](store.md#codecs) ![b](pictures/sink.png)"
     )
     assert translate_links("[a](../CONTRIBUTING.md#the-gate)", "store.md", {}) == "[a](contributing.md#the-gate)"
-    assert (
-        translate_links("[a](../../README.md), [b](../store.md)", "errors/stores.md", {})
-        == "[a](../index.md), [b](../store.md)"
-    )
+    assert translate_links("[a](../README.md), [b](page.md)", "store.md", {}) == "[a](index.md), [b](page.md)"
     assert translate_links("[a](../docs/store.md)", "benchmarks.md", {}) == "[a](store.md)"
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
 
-#: A small pi0.5 for the suite `cubes`; `docs/cubes.md` says how it was trained and what it can do.
+#: A small pi0.5 for the suite `cubes`; `docs/validation.md` says how it was trained and what it can do.
 CUBES_POLICY = "pi05_cubes"
 SHIPPED: dict[str, Path] = {CUBES_POLICY: Path(__file__).parent / CUBES_POLICY}
 
@@ -35,7 +35,7 @@ _OF_LIBERO = (
 )
 
 _EXAMPLES = """\
-  vla-attention capture pi                                           a small trained policy and its tasks, docs/cubes.md
+  vla-attention capture pi                                      a small trained policy and its tasks, docs/validation.md
   vla-attention capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
       --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
   vla-attention capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10

@@ -107,7 +107,7 @@ def _adapter(folder: Path) -> str:
     return (
         f"'{folder}' holds an adapter (LoRA) of {base}, not a whole policy: merge it with peft's "
         "PeftModel.from_pretrained(policy, ...).merge_and_unload(), save the policy with save_pretrained, and give "
-        "that folder (docs/checkpoints.md has the lines)."
+        "that folder (docs/my-checkpoint.md has the lines)."
     )
 
 

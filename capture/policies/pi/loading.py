@@ -146,7 +146,7 @@ def choose_config(
         raise UnsupportedCheckpoint(
             f"'{folder}' has no {CONFIG_FILE}, as openpi's train_pytorch.py leaves it, so that nothing states its "
             f"heads and the actions of a call. Give --config-name NAME (openpi's {listing(NAMED_CONFIGS)}), or "
-            f"--model-config FILE, a file like {CASE_FILE} (docs/checkpoints.md)."
+            f"--model-config FILE, a file like {CASE_FILE} (docs/my-checkpoint.md)."
         )
     return ChosenConfig(stated_config(read_json_object(folder / CONFIG_FILE), pi05=has_pi05), CONFIG_FILE)
 

@@ -1,7 +1,7 @@
 """Layouts of policies that people run: a function of a policy object returns its `PolicyLayout`.
 
 What is fixed by the policy's configuration is read from it; what a call decides (prompt, cameras of a processor) is an
-argument. docs/policies.md says with which versions each was tried, and what was checked.
+argument. docs/my-policy.md says with which versions each was tried, and what was checked.
 """
 
 from vla_attention.capture.torch_policies.layouts.act import act

@@ -46,7 +46,7 @@ class FoundModule:
         raise NotThisPolicy(
             f"The layout '{layout}' is for {' or '.join(classes)}, but a {type(policy).__name__} was given, with "
             f"modules of {listing(sorted({type(module).__name__ for module in modules.values()}))}. Give the policy "
-            "itself, or write a layout (docs/your-policy.md)."
+            "itself, or write a layout (docs/my-policy.md)."
         )
 
     def inside(self, name: str) -> str:

@@ -20,17 +20,18 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import GivenInputs
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.layout import Piece, Prompt
 from vla_attention.schemas.plumbing import Plumbing
 from vla_attention.schemas.stores.store_format import Recording
 
 RECORDING = Recording((0,), (0,), (0,), (0, 1), "mean", 4, 23, frames=False)
+UNCHANGED = Interventions()
 TOLD = ("touch a cube", "lift the bowl", "push left now", "lift the bowl")
 
 
-def looked(policy: Any, *told: str) -> Plumbing:
-    """What is found for a batch of calls with these instructions."""
+def looked(policy: Any, *told: str, changes: Interventions = UNCHANGED) -> Plumbing:
+    """What is found for a batch of calls with these instructions, under a run's interventions."""
     pictures = np.random.default_rng(0).integers(0, 255, (len(told), 4, 4, 3), dtype=np.uint8)
     calls = [
         PolicyCall(
@@ -38,7 +39,7 @@ def looked(policy: Any, *told: str) -> Plumbing:
         )
         for i, (picture, text) in enumerate(zip(pictures, told, strict=True))
     ]
-    caller = Caller(policy, RECORDING, RunChanges(Interventions(), dict(enumerate(TOLD))))
+    caller = Caller(policy, RECORDING, RunChanges(changes, dict(enumerate(TOLD))))
     before, made = torch.get_rng_state(), caller.make(calls)
     found = look_at_words(caller, calls, made)
     assert torch.equal(before, torch.get_rng_state())
@@ -113,6 +114,13 @@ def test_a_policy_that_knows_the_sentences_of_its_tasks_alone():
 
     found = looked(toy(prepare_again=only_its_own), TOLD[0])
     assert (found.other, found.input_changed, found.why_not) == ("", None, "no encoding")
+
+
+def test_words_that_the_run_knocks_out_are_not_in_the_other_sentence():
+    knocked_out = Interventions(keys=(KeyKnockout("word:cube", queries="action"),))
+    found = looked(make_toy_policy("weights", 4), TOLD[0], changes=knocked_out)
+    assert (found.input_changed, found.action_changed) == (None, None)
+    assert "word:cube" in found.why_not
 
 
 def test_the_answer_is_of_the_process_that_heard_least(tmp_path):
