@@ -72,7 +72,7 @@ def captured(tmp_path_factory):
 @pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.parametrize(
-    "page", ["does-it-listen", "why-did-it-fail", "what-changed", "effects", "reading", "statistics", "groups"]
+    "page", ["does-it-listen", "why-did-it-fail", "what-changed", "effects", "reading", "statistics"]
 )
 def test_questions_to_a_store(tmp_path, monkeypatch, captured, page):
     monkeypatch.chdir(tmp_path)
