@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from benchmarks.validation.success import success_under
 from benchmarks.validation.tables import fill_page
 from vla_attention.capture.environments.cubes.tasks import NUM_BASE_TASKS
 from vla_attention.schemas.command_line import run_command
+
+#: The results that the page shows.
+ROWS = Path(__file__).with_name("results.json")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -43,7 +47,9 @@ def _run(argv: list[str] | None) -> int:
     )
     parser.add_argument("policies", type=Path, metavar="POLICIES", help="folder of trained policies")
     parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="folder of stores and results")
-    parser.add_argument("--page", type=Path, metavar="FILE", help="write the tables into this page, too")
+    parser.add_argument(
+        "--page", type=Path, metavar="FILE", help="write tables into this page, and their rows beside us"
+    )
     parser.add_argument("--reduced", action="store_true", help="two tasks, ten steps, one policy call of each episode")
     given = parser.parse_args(argv)
     policies = [KnownPolicy(SHIPPED, "pi05_cubes", "cubes", SHIPPED), *read_policies(given.policies)]
@@ -54,6 +60,7 @@ def _run(argv: list[str] | None) -> int:
     print(path)
     if given.page is not None:
         fill_page(given.page, results)
+        shutil.copy(path, ROWS)
     return 0
 
 

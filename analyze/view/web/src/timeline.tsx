@@ -27,7 +27,7 @@ function kinds(): Record<string, { title: string; of: () => Curves | null }> {
   const [numbers, courses] = [groups.value.value, episode?.courses];
   const atReplans = (curves: Curve[]): Curves => ({ steps: episode?.starts ?? [], curves });
   const found: Record<string, { title: string; of: () => Curves | null }> = {};
-  if (numbers?.ratio) found.ratio = { title: "ratio of pictures to text", of: () => atReplans([{ name: "ratio", values: column(numbers.ratio) }, { name: "of even attention", values: column(numbers.uniform_ratio) }]) };
+  if (numbers?.ratio) found.ratio = { title: "ratio of pictures to text", of: () => atReplans([{ name: "ratio", values: column(numbers.ratio) }, { name: "if spread evenly", values: column(numbers.uniform_ratio) }]) };
   if (numbers) found.masses = { title: "parts of the attention", of: () => atReplans(Object.entries(numbers.groups).map(([name, { fraction }]) => ({ name, values: column(fraction) })).filter(({ values }) => values.some((one) => (one ?? 0) > 0.005))) };
   if (part("group")) found.group = { title: "own group", of: () => atReplans(["seen", "read"].map((side) => ({ name: side === "seen" ? "patches" : "words", values: range(numReplans.value).map((at) => (massesAt(at) ? sumOf(massesAt(at)!, pickedKeys({ scene: main, at })[side as "seen" | "read"]) : null)) })).filter(({ values }) => values.some(Boolean))) };
   if (courses) {
