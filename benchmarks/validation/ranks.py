@@ -83,10 +83,12 @@ def ranks(
             attention |= masses(store, episode, groups)
         for family, (_, members) in FAMILIES.items():
             selectors = [one for kind in members for one in kinds[episode.name][kind].values()]
-            mass = np.array([np.nan_to_num(attention[one][changed.replans]).mean() for one in selectors])
             for which in queries:
-                effects = np.array([changed.effect(f"{one} {which}", spread).mean() for one in selectors])
-                values.setdefault((family, which), []).append(spearman(mass, effects))
+                effects = np.array([changed.effect(f"{one} {which}", spread) for one in selectors])
+                mass = np.where(np.isnan(effects), np.nan, [attention[one][changed.replans] for one in selectors])
+                seen = ~np.isnan(effects).all(axis=1)  # an object may be out of view
+                found = spearman(np.nanmean(mass[seen], axis=1), np.nanmean(effects[seen], axis=1))
+                values.setdefault((family, which), []).append(found)
             counts[family].append(len(selectors))
     return [
         {"family": family, "queries": which, "items": float(np.mean(counts[family]))} | _mean(of)
