@@ -2,7 +2,7 @@
 
 Usage: python -m tests.kit.parity CASE [--json] [--device cuda]
 
-A case is a folder with case.json, inputs.npz, expected.npz and a checkpoint; docs/checkpoints.md says how to make one.
+A case is a folder with case.json, inputs.npz, expected.npz and a checkpoint; docs/my-checkpoint.md says how.
 Prints the largest differences. Exit code 1: one of them is beyond its limit.
 """
 

@@ -82,7 +82,7 @@ def test_a_lerobot_policy_gives_the_rows_of_its_run(tmp_path, monkeypatch, token
 
 @pytest.mark.parametrize("encoding", [H264])
 def test_a_video_gives_nearly_the_rows_of_the_run(tmp_path, monkeypatch, encoding):
-    """With the trained policy that comes along; docs/data-sets.md has what was measured on pictures of a simulator."""
+    """With the trained policy that we ship; docs/my-data-set.md has what was measured on pictures of a simulator."""
     cubes = ("--checkpoint", "pi05_cubes")
     simulate(monkeypatch, tmp_path / "run.zarr", *cubes)
     episodes = episodes_of_store(tmp_path / "run.zarr", LIBERO_COLUMNS)
