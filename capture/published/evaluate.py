@@ -170,7 +170,7 @@ def _analyze(arguments: argparse.Namespace, settings: RunSettings, output: Path)
         say(f"This policy has {policy.num_layers} layers, and not {published}: analysing all of them.")
         more = []
     if settings.task_ids is not None:
-        more += ["--tasks", *map(str, settings.task_ids)]
+        more += ["--task", *map(str, settings.task_ids)]
     if not arguments.layers or arguments.output_dir is not None:
         return run_analysis(arguments, store, output, more)
     # In the published default folder, each group of layers keeps its results in a folder of its own. The default folder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import vla_attention
 from vla_attention.capture.policies.cosmos.family import FAMILY as COSMOS
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.pi.family import FAMILY as PI
@@ -118,3 +120,12 @@ def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, program, words,
     assert expected in said
     assert said.count("\n") == 1
     assert os.listdir(tmp_path) == []
+
+
+def test_the_analysis_of_one_task_reads_that_task_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["--checkpoint", "pi05_cubes", "--task-suite", "cubes", "--task-id", "1", "--stage", "analyze"]
+    places = ["--output", str(vla_attention.example("cubes")), "--output-dir", "results"]
+    assert evaluate("evaluate-attention-ratio", [*words, *places, "--layers", "0"]) == 0
+    found = json.loads(Path("results/attention_ratio_results_cubes.json").read_text(encoding="utf-8"))
+    assert [episode["task_id"] for episode in found] == [1, 1]
