@@ -1,4 +1,4 @@
-"""The Python API: an opened store whose methods are the commands of `vla-analyze` and return polars frames.
+"""The Python API: an opened store whose methods are the commands of `vla-analyze` and return answers with their tables.
 
 The examples run as tests, with `store` and `other` being paths of small stores, `with_effects` and `replayed` those of
 stores with recorded effects and of a replayed data set, and `folder` that of an empty folder.
@@ -40,8 +40,8 @@ def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 class OpenStores:
     """One or several stores, opened for questions. Made by `va.open`; holds the episodes that were complete then.
 
-    Every method takes the keywords of `vla_attention.analyze.measures.question_settings.SettingKeywords`, reads only
-    what it needs and returns a polars frame; where there are several, `table` or `level` chooses one. Mistakes raise a
+    Every question takes the keywords of `vla_attention.analyze.measures.question_settings.SettingKeywords`, reads only
+    what it needs and returns an `Answer`, whose tables are polars frames: `answer["NAME"]`. Mistakes raise a
     `va.UserError` that says what exists.
 
     Attributes:

@@ -80,7 +80,7 @@ def record(
     ...                 with episode.replan(env_step=step) as replan:
     ...                     replan.actions = policy.act(step)
     ...             episode.success = True
-    >>> va.open(store).ratios().filter(scope="task")["instruction"][0]
+    >>> va.open(store).analyze()["tasks"].filter(scope="task")["instruction"][0]
     'pick the bowl'
 
     Args:
