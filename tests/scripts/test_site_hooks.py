@@ -15,7 +15,7 @@ def test_links_are_those_of_the_site():
     assert translate_links("[a](docs/store.md#codecs) ![b](docs/pictures/sink.png)", "index.md", {}) == (
         "[a](store.md#codecs) ![b](pictures/sink.png)"
     )
-    assert translate_links("[a](../CONTRIBUTING.md#the-gate)", "store.md", {}) == "[a](contributing.md#the-gate)"
+    assert translate_links("[a](../CONTRIBUTING.md#tests)", "store.md", {}) == "[a](contributing.md#tests)"
     assert translate_links("[a](../README.md), [b](page.md)", "store.md", {}) == "[a](index.md), [b](page.md)"
     assert translate_links("[a](../docs/store.md)", "benchmarks.md", {}) == "[a](store.md)"
 
