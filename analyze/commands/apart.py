@@ -124,7 +124,9 @@ def _finding(
 
 
 def _cell(row: Mapping[str, Any], columns: Sequence[Column]) -> str:
-    return ", ".join(f"{column.title} {row[column.name]}" for column in columns if column.screen)
+    said = [(column.title, row[column.name]) for column in columns if column.screen]
+    named = {True: "", False: "not "}  # solved, not solved
+    return ", ".join(f"{named[at]}{title}" if isinstance(at, bool) else f"{title} {at}" for title, at in said)
 
 
 def _figures(levels: Levels, tables: Sequence[Table], axes: Sequence[str]) -> list[Figure]:
