@@ -30,7 +30,7 @@ _MAIN_OPTIONS = {
     *("--checkpoint", "--ckpt-path", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series"),
     *("--policy", "--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
     *("--csv", "--output", "--resume", "--repair", "--tar"),
-    *("--without", "--help-all"),
+    *("--without", "--file", "--port", "--help-all"),
 }
 
 

@@ -58,18 +58,22 @@ def _again(found: re.Match[str]) -> str:
 
 
 def chosen(lines: Sequence[str], ranges: str | None) -> list[str]:
-    """The lines of ranges such as `1-3 7`, counted from 1, and `...` between ranges.
+    """The lines of ranges such as `1-3 7`, counted from 1, with `...` for what lies between and after them.
 
     >>> chosen(["a", "b", "c", "d"], "1-2 4")
     ['a', 'b', '...', 'd']
+    >>> chosen(["a", "b", "c", "d"], "1-2")
+    ['a', 'b', '...']
     """
     if ranges is None:
         return list(lines)
-    parts = []
+    parts, end = [], 0
     for given in ranges.split():
         first, _, last = given.partition("-")
-        parts.append(list(lines[int(first) - 1 : int(last or first)]))
-    return [line for i, part in enumerate(parts) for line in (["..."] if i else []) + part]
+        end = int(last or first)
+        parts.append(list(lines[int(first) - 1 : end]))
+    shown = [line for i, part in enumerate(parts) for line in (["..."] if i else []) + part]
+    return shown + ["..."] * (end < len(lines))
 
 
 if __name__ == "__main__":

@@ -127,13 +127,14 @@ def test_the_questions_of_the_readme_run(tmp_path, monkeypatch):
     """On stores of the suite `cubes`: the one that comes along, and one with effects."""
     monkeypatch.chdir(tmp_path)
     Path("runs").mkdir()
-    lines = re.findall(r"(vla-attention (?:\w+) runs/cubes\.zarr[^`:]*)", " ".join(text_of(ROOT / "README.md").split()))
+    text = " ".join(text_of(ROOT / "README.md").split())
+    lines = re.findall(r"(vla-attention (?:\w+) runs/cubes(?:_effects)?\.zarr[^`:]*)", text)
     questions = [shlex.split(line)[1:] for line in lines if " view " not in line]
     assert {words[0] for words in questions} == {"analyze", "language", "objects", "words", "effects"}
     for words in questions:
         store = unpacked(STORES["effects" if words[0] == "effects" else "cubes"])
-        Path("runs/cubes.zarr").unlink(missing_ok=True)
-        Path("runs/cubes.zarr").symlink_to(store, target_is_directory=True)
+        Path(words[1]).unlink(missing_ok=True)
+        Path(words[1]).symlink_to(store, target_is_directory=True)
         assert vla_attention([word for word in words if word != "-->"]) == 0
 
 

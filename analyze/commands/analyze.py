@@ -184,6 +184,8 @@ def _of_ratio(
     if cell["ratio_lift"] is None or cell["uniform_ratio"] is None:
         return [Finding(f"{sentence} {ratio}.", asks, numbers, limit)]
     even = f"attention spread evenly over all tokens would give {cell['uniform_ratio']:.3g}"
+    if cell["ratio_of_means"] is not None:  # what the parts above give
+        ratio += f" (geometric mean over layers and calls; of all attention together {cell['ratio_of_means']:.3g})"
     return [
         Finding(f"{sentence} {_token_by_token(question, cell, above, below)}", asks, numbers, limit),
         Finding(f"{ratio}; {even}.", "The ratio?", numbers),

@@ -56,7 +56,9 @@ def about(question: Question) -> list[str]:
     policy = question.stores[0].attributes.policy
     suites = listing(dict.fromkeys(store.suite for store in question.stores), 4)
     outcomes = [item.episode.attributes.success for item in question.selected]
-    line = f"{policy.name} on {suites}: {solved(outcomes, question.num_tasks)}."
+    again = all(store.attributes.rerun_of is not None for store in question.stores)
+    where = " in the run whose policy calls were made again" if again else ""
+    line = f"{policy.name} on {suites}: {solved(outcomes, question.num_tasks)}{where}."
     return [line, *question.told, *([UNTRAINED] if question.untrained else [])]
 
 

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 _EXAMPLES = """examples:
   vla-attention view runs/cubes.zarr
   vla-attention view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
+  vla-attention view runs/cubes.zarr --file episode.html --task 3 --episode 1       one episode, to send
   vla-attention view hf://datasets/ORG/NAME/libero_10.zarr
   vla-attention view runs/cubes.zarr --port 8765 --no-open           on another machine, with ssh -L 8765:127.0.0.1:8765
   vla-attention view runs/cubes.zarr --port 8765 --allow-host hub.example.org      behind a proxy, as JupyterHub
   vla-attention view runs/cubes.zarr --site public/cubes               a folder for a web server
-  vla-attention view runs/cubes.zarr --file failed.html --task 3 --episode 1       one episode, to send
 
 The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
 place. With the same stores and the same --port the link stays the same.

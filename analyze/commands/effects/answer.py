@@ -31,7 +31,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.errors import BadArgument, listing, plural
 
-_DECIDE = "Which words decide?"
+_MISSING = "What if a word is left out?"
 #: Of the items, so many are named, and drawn over time.
 _MOST_NAMED, _MOST_DRAWN = 5, 4
 #: From this part of a squared effect on, it is said that it is the gripper's.
@@ -69,10 +69,10 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
     try:
         found = recorded_effects(question, attention=False)
     except BadArgument as error:
-        return [Finding(f"Not shown: {error}", _DECIDE)], []
+        return [Finding(f"Not shown: {error}", _MISSING)], []
     if found is None:
         said = "Not recorded: how the action changes without a word."
-        return [Finding(said, _DECIDE, next_step=how_to_record_effects(question))], []
+        return [Finding(said, _MISSING, next_step=how_to_record_effects(question))], []
     episodes = found.episodes()
     items = with_untested(question, by_item(summary_of(episodes, question.sampling)))
     table = items.filter(item_kind="word")
@@ -119,7 +119,7 @@ def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
     untested = words.height - tested.height
     limits = [f"{plural(untested, 'word')} of the instructions not tested."] if untested else []
     if tested.is_empty():
-        return Finding("Not tested: no effect of a single word was recorded.", _DECIDE, {}, " ".join(limits))
+        return Finding("Not tested: no effect of a single word was recorded.", _MISSING, {}, " ".join(limits))
     sure, few = tested.filter(than_noise=MORE), tested.filter(than_noise=FEW)
     top = (sure if sure.height else tested).row(0, named=True)
     without = f"{'Without' if top['reader'] == 'total' else 'Hidden from the action tokens,'} {top['item']}"
@@ -151,7 +151,7 @@ def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
         turn = tested.sort("turn", descending=True, nulls_last=True).row(0, named=True)
         if turn["item"] != top["item"] and turn["turn"] is not None:
             said += f" The hand's direction turns most without {turn['item']}: by {turn['turn']:.0f} degrees."
-    return Finding(said, _DECIDE, numbers, " ".join(limits))
+    return Finding(said, _MISSING, numbers, " ".join(limits))
 
 
 def _named(rows: pl.DataFrame, value: str = "effect") -> str:
@@ -215,8 +215,10 @@ def _unlike_attention(words: pl.DataFrame) -> list[Finding]:
     """Words whose attention says something else than their effect."""
     silent = words.filter(pl.col("lift") < 1, than_noise=MORE)
     idle = words.filter(pl.col("lift") > 1, pl.col("than_noise").is_in([OPEN, LESS]))
-    parts = [f"less than its share, and shown to decide: {_named(silent, 'lift')}"] if silent.height else []
-    parts += [f"more than its share, and not shown to: {_named(idle, 'lift')}"] if idle.height else []
+    parts = (
+        [f"less than its share, and the action changes without it: {_named(silent, 'lift')}"] if silent.height else []
+    )
+    parts += [f"more than its share, and no change is shown without it: {_named(idle, 'lift')}"] if idle.height else []
     said = "; ".join(parts)
     limit = "In brackets: attention to the word, evenly spread over all tokens = 1."
     return [Finding(f"{said[0].upper()}{said[1:]}.", "Does attention tell?", limit=limit)] if parts else []
