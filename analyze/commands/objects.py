@@ -37,7 +37,7 @@ _POINTING: dict[str, Scale] = {
 }  # fmt: skip
 _IOU: dict[str, Scale] = {"iou": "share", "iou_chance": "share"}
 _OVER_PLACE = ("enrichment", "enrichment_elsewhere")
-_ASKS = "At what?"
+_ASKS = "What does it look at?"
 
 
 def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> Result:
