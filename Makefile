@@ -117,7 +117,7 @@ docs: .venv-docs/installed .venv/analyze-installed
 	.venv-docs/bin/python scripts/check_site.py site
 
 pictures: .venv/analyze-installed
-	$(BIN)/python scripts/make_pictures.py --run $(STORE)
+	$(BIN)/python scripts/make_pictures.py
 	$(BIN)/python scripts/make_samples.py
 	$(BIN)/vla-attention view $$($(BIN)/python -c 'import vla_attention as va; print(va.example("cubes"))') --file docs/episode.html --task 2
 

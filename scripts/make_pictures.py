@@ -1,9 +1,6 @@
-"""Draw the pictures of README.md and of `docs/reading.md`, with the tool's own commands.
+"""Draw the pictures of `docs/reading.md` from made-up rows with a known truth, with the tool's own commands.
 
-Usage: python scripts/make_pictures.py [--run runs/cubes.zarr] [--folder docs/pictures]
-
-Those of README.md are of the run of `make capture`; those of the guide are of made-up rows with a known truth.
-`make pictures` draws both.
+Usage: python scripts/make_pictures.py [--folder docs/pictures]
 """
 
 from __future__ import annotations
@@ -75,13 +72,6 @@ def specialist(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray)
 SINK = ["overlay", "--cameras", "base_0_rgb", "--episode", "0"]
 
 
-def draw_run(store: Path, scratch: Path, folder: Path) -> None:
-    """Draw the pictures of README.md: a strip of one episode, and the layers."""
-    strip = ["overlay", "--task", "1", "--episode", "0"]
-    draw("overlay", store, strip, "overlay_task001_episode000", scratch / "overlay", folder)
-    draw("layers", store, ["analyze"], "layer_profile", scratch / "analyze", folder)
-
-
 def draw(name: str, store: Path, command: list[str], picture: str | None, scratch: Path, folder: Path) -> None:
     """Run a command on a store and keep one of its pictures (None: its only one) as NAME.png."""
     if analyze([command[0], str(store), *command[1:], "--output", str(scratch)]):
@@ -94,13 +84,9 @@ def draw(name: str, store: Path, command: list[str], picture: str | None, scratc
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--folder", type=Path, default=Path(__file__).resolve().parents[1] / "docs/pictures")
-    parser.add_argument("--run", type=Path, help="the store of `make capture`; without it README.md keeps its pictures")
-    arguments = parser.parse_args()
-    folder = arguments.folder
+    folder = parser.parse_args().folder
     folder.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix="pictures_"))
-    if arguments.run is not None:
-        draw_run(arguments.run, scratch / "run", folder)
     shape = StoreSpec(
         tokens=libero_tokens(6),
         num_layers=18,
