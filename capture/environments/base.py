@@ -73,7 +73,7 @@ class EnvironmentSettings:
 
     protocol: the evaluation whose picture size and, in LIBERO, whose resets are used. The built-in suite has seeds of
         its own.
-    libero_assets: the folder of LIBERO's assets; None searches the places that `libero_installation.find_assets` lists.
+    libero_assets: the folder of LIBERO's assets; None searches the places that `libero_assets.find_assets` lists.
     """
 
     protocol: EvaluationProtocol = OPENPI

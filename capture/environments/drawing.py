@@ -15,7 +15,8 @@ from functools import partial
 from pathlib import Path
 
 from vla_attention.capture.environments.base import Suite
-from vla_attention.capture.environments.libero_installation import find_assets, load_libero
+from vla_attention.capture.environments.libero_assets import find_assets
+from vla_attention.capture.environments.libero_installation import load_libero
 from vla_attention.capture.environments.robosuite_installation import (
     DEFAULT_GL,
     CannotDraw,

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import EnvironmentSettings, Task
-from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
+from vla_attention.capture.environments.libero_assets import find_assets
+from vla_attention.capture.environments.libero_installation import load_libero, package_folder
 from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
 from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.schemas.episode_steps import TaskGoal

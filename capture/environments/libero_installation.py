@@ -1,4 +1,4 @@
-"""Finding and loading the LIBERO package and its assets: no questions, no downloads, no files in the home folder.
+"""Finding and loading the LIBERO package: no questions, no downloads, no files in the home folder.
 
 The published package asks on standard input for the places of its files, saves the answer in the home folder, and
 downloads missing assets. A batch job can do none of this, so this module sets everything before the package can ask.
@@ -28,25 +28,7 @@ from vla_attention.capture.environments.robosuite_installation import (
     readable_device_choice,
 )
 from vla_attention.capture.environments.task_families import sentence_template
-from vla_attention.capture.foreign_files.checked_files import check_folder
-from vla_attention.schemas.errors import INSTALL_LIBERO, MissingDependency, UserError
-
-ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
-#: The dataset on the Hugging Face hub that the package itself (hf-libero) downloads.
-ASSETS_SOURCE = "lerobot/libero-assets"
-
-ASSET_SUBFOLDERS = (
-    "scenes",
-    "textures",
-    "articulated_objects",
-    "stable_hope_objects",
-    "stable_scanned_objects",
-    "turbosquid_objects",
-)
-
-
-class LiberoAssetsMissing(UserError, FileNotFoundError):
-    """No folder of LIBERO assets was found, or the given folder is incomplete."""
+from vla_attention.schemas.errors import INSTALL_LIBERO, MissingDependency
 
 
 @functools.cache
@@ -86,37 +68,6 @@ def list_libero_tasks(suite: Suite) -> list[TaskTexts]:
             "run 'make setup'."
         )
     return [(name, instruction_of(name), sentence_template(instruction_of(name))) for name in names]
-
-
-def find_assets(configured: Path | None) -> Path:
-    """Return the folder of the assets: `configured`, else VLA_LIBERO_ASSETS, else the package's own or its download.
-
-    Raises:
-        LiberoAssetsMissing: none of these places has all asset folders.
-    """
-    from_variable = os.environ.get(ASSETS_VARIABLE)
-    for given, origin in ((configured, "--libero-assets"), (from_variable, ASSETS_VARIABLE)):
-        if given:
-            folder = Path(given).expanduser()
-            absent = [name for name in ASSET_SUBFOLDERS if not (folder / name).is_dir()]
-            if absent:
-                problem = f"lacks {', '.join(absent)}" if folder.is_dir() else "does not exist"
-                raise LiberoAssetsMissing(
-                    f"The LIBERO asset folder '{folder}' ({origin}) {problem}; give the folder that holds "
-                    f"{', '.join(ASSET_SUBFOLDERS)}, for example a copy of the hub dataset {ASSETS_SOURCE}."
-                )
-            # MuJoCo opens pipes and devices among them by itself.
-            check_folder(folder.resolve(), LiberoAssetsMissing, inside=False)
-            return folder.resolve()
-    own_places = (package_folder() / "assets", Path.home() / ".cache" / "libero" / "assets")
-    for folder in own_places:
-        if all((folder / name).is_dir() for name in ASSET_SUBFOLDERS):
-            return folder
-    raise LiberoAssetsMissing(
-        f"No LIBERO assets (scenes, objects, textures) were found in {own_places[0]} or {own_places[1]}; fetch them "
-        f"with `hf download --repo-type dataset {ASSETS_SOURCE} --local-dir {own_places[1]}`, or give a folder of "
-        f"them with --libero-assets PATH or {ASSETS_VARIABLE}=PATH."
-    )
 
 
 @functools.cache

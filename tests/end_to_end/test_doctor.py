@@ -7,7 +7,7 @@ import re
 import pytest
 
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.environments.libero_installation import ASSETS_VARIABLE
+from vla_attention.capture.environments.libero_assets import ASSETS_VARIABLE
 
 pytestmark = pytest.mark.simulator
 

@@ -20,7 +20,7 @@ from tests.thorough.hostile_checkpoints.hostile_files import (
     torch_zip,
 )
 from tests.thorough.hostile_runs import PACKAGES, Make
-from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS
+from vla_attention.capture.environments.libero_assets import ASSET_SUBFOLDERS
 
 #: The first task of the suite.
 SUITE, NUMBER = "libero_10", 0
