@@ -37,6 +37,8 @@ class Suite:
         (language-conditioned tasks on robosuite) need no download.
     max_steps: policy steps after which an episode counts as failed, as in openpi's evaluation. Other protocols may have
         other numbers (`episode_protocol.py`).
+    simulator_bytes: memory of one simulator in a process of its own, the most of the tasks that were measured (LIBERO's
+        with its original assets), rounded up.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Suite:
     num_tasks: int
     max_steps: int
     initial_states_per_task: int
+    simulator_bytes: float
 
 
 @dataclass(frozen=True)

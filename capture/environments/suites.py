@@ -13,20 +13,20 @@ from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, list_cube
 from vla_attention.capture.environments.robosuite_installation import find_robosuite
 from vla_attention.schemas.errors import look_up
 
-#: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`).
+#: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`); benchmarks/README.md has the memory.
 SUITES: tuple[Suite, ...] = (
-    Suite("libero_spatial", "libero", num_tasks=10, max_steps=220, initial_states_per_task=50),
-    Suite("libero_object", "libero", num_tasks=10, max_steps=280, initial_states_per_task=50),
-    Suite("libero_goal", "libero", num_tasks=10, max_steps=300, initial_states_per_task=50),
-    Suite("libero_10", "libero", num_tasks=10, max_steps=520, initial_states_per_task=50),
-    Suite("libero_90", "libero", num_tasks=90, max_steps=400, initial_states_per_task=50),
-    Suite("robosuite", "robosuite", num_tasks=8, max_steps=200, initial_states_per_task=50),
-    Suite("cubes", "cubes", num_tasks=17, max_steps=150, initial_states_per_task=50),
+    Suite("libero_spatial", "libero", num_tasks=10, max_steps=220, initial_states_per_task=50, simulator_bytes=2.7e9),
+    Suite("libero_object", "libero", num_tasks=10, max_steps=280, initial_states_per_task=50, simulator_bytes=2.7e9),
+    Suite("libero_goal", "libero", num_tasks=10, max_steps=300, initial_states_per_task=50, simulator_bytes=2.3e9),
+    Suite("libero_10", "libero", num_tasks=10, max_steps=520, initial_states_per_task=50, simulator_bytes=3.3e9),
+    Suite("libero_90", "libero", num_tasks=90, max_steps=400, initial_states_per_task=50, simulator_bytes=3.3e9),
+    Suite("robosuite", "robosuite", num_tasks=8, max_steps=200, initial_states_per_task=50, simulator_bytes=8.0e08),
+    Suite("cubes", "cubes", num_tasks=17, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
     # The same and six more tasks, which the policy that comes along was trained on and solves too seldom.
-    Suite("cubes_harder", "cubes", num_tasks=23, max_steps=150, initial_states_per_task=50),
+    Suite("cubes_harder", "cubes", num_tasks=23, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
     # For control policies (docs/validation.md): the first twelve tasks, with a mark in the picture.
-    Suite("cubes_marked", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50),
-    Suite("cubes_mark_only", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50),
+    Suite("cubes_marked", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
+    Suite("cubes_mark_only", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
 )
 #: `--task-suite all` stands for these, in this order: the standard suites of LIBERO.
 ALL_SUITES = "all"

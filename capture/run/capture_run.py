@@ -84,7 +84,7 @@ def run_capture(
         check_initial_state_index(task, settings.num_episodes - 1)
     environment = EnvironmentSettings(evaluation, settings.libero_assets)
     jobs, source_lines = _jobs(settings, wanted, environment, protocol.max_steps)
-    num_envs = settings.num_envs or default_num_envs()
+    num_envs = settings.num_envs or default_num_envs(settings.suite)
     batch = _policy_batch(settings, policy, device, num_envs)
     store = open_run(settings.store, attributes, settings.output.mode)
     done = store.committed()

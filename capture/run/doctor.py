@@ -52,7 +52,7 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
         if status == "MISSING":
             missing.append(what)
 
-    look("memory", lambda: find_memory(threads))
+    look("memory", lambda: find_memory(threads, suite))
     look("robosuite", _find_robosuite)
     if suite.kind == "libero":
         look("LIBERO", lambda: _find_libero(suite))
@@ -78,13 +78,14 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
     return int(bool(missing))
 
 
-def find_memory(threads: Threads) -> Finding:
-    """Return the memory that this process may still take, and the threads of the policy."""
-    of_policy = f"{plural(threads.number, 'thread')} for the policy ({threads.source})."
+def find_memory(threads: Threads, suite: Suite) -> Finding:
+    """Return the memory that this process may still take and a simulator needs, and the threads of the policy."""
+    each = f"A simulator of {suite.name} takes up to {format_bytes(suite.simulator_bytes)}"
+    of_policy = f"{each}; {plural(threads.number, 'thread')} for the policy ({threads.source})."
     least = min(memory_limits(), key=lambda limit: limit.bytes, default=None)
     if least is None:
         return "note", f"This system does not say how much is available. {of_policy}"
-    return "ok", f"{format_bytes(least.bytes)} available, by what {least.by} leaves; {of_policy}"
+    return "ok", f"{format_bytes(least.bytes)} available, by what {least.by} leaves. {of_policy}"
 
 
 def _find_robosuite() -> Finding:

@@ -21,8 +21,6 @@ from vla_attention.schemas.threads import available_cores
 
 #: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
 MOST_BY_DEFAULT = 8
-#: Memory of a simulator, for their number without being asked: in LIBERO 1.8 GB, of which the scene is most.
-SIMULATOR_BYTES = 2e9
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class RunSettings:
     )
     num_envs: int | None = option(
         "simulators that run at a time, each in a process of its own; 1 simulates in the policy's process (default: "
-        f"the cores that this process may use, at most {MOST_BY_DEFAULT}, and 2 GB of memory each)",
+        f"the cores that this process may use, at most {MOST_BY_DEFAULT}, and as many as fit into memory)",
         None,
         least=1,
     )
@@ -133,6 +131,6 @@ def _task_ids(suite: Suite, chosen: Sequence[int | str]) -> tuple[int, ...]:
     return tuple(sorted(task_ids))
 
 
-def default_num_envs() -> int:
+def default_num_envs(suite: Suite) -> int:
     """Return the number of simulators without `--num-envs`: as many as there are cores, and as fit into memory."""
-    return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / SIMULATOR_BYTES)))
+    return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / suite.simulator_bytes)))

@@ -90,7 +90,7 @@ def test_words_by_kind(sentence, words):
     assert [*words_by_kind(sentence).values()] == [frozenset(of_kind.split()) for of_kind in words]
 
 
-SUITE = Suite("made_up", "libero", 5, 10, 50)
+SUITE = Suite("made_up", "libero", 5, 10, 50, 1e9)
 TASKS = [Task("made_up", number, f"t{number}", f"do {number}", 50) for number in range(5)]
 
 

@@ -68,5 +68,5 @@ def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
         "vla_attention.capture.engine.simulator_process.make_environment",
         lambda suite, task_id, settings: ToldScene(task_id),
     )
-    monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)
+    monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda suite: 1)
     monkeypatch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")

@@ -21,7 +21,7 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero
 @pytest.fixture(scope="module", autouse=True)
 def original_assets():
     try:
-        number, *faults = compare_with_originals(find_assets(None))
+        _, *faults = compare_with_originals(find_assets(None))
     except UserError as error:
         pytest.skip(f"needs LIBERO's original assets: {error}")
     if any(faults):

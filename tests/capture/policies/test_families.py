@@ -52,7 +52,7 @@ class StubEnvironment:
 def toy_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(families, "FAMILY_MODULES", (*families.FAMILY_MODULES, "tests.kit.toy_family"))
     monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: StubEnvironment())
-    monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)
+    monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda suite: 1)
     monkeypatch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")
 
 

@@ -12,6 +12,7 @@ from tests.kit.lazy_imports import help_without_libraries
 from vla_attention.capture.commands.arguments import ClusterSettings
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
+from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.replay.arguments import ReplayOutput, ReplaySettings
@@ -25,14 +26,14 @@ from vla_attention.schemas.options import add_options, read_options
 def test_there_are_as_many_simulators_as_cores_and_no_more_than_eight(cores, expected, monkeypatch):
     monkeypatch.setattr(run_settings, "available_cores", lambda: cores)
     monkeypatch.setattr(run_settings, "memory_left", lambda: 1e12)
-    assert run_settings.default_num_envs() == expected
+    assert run_settings.default_num_envs(find_suite("libero_10")) == expected
 
 
-@pytest.mark.parametrize(("left", "expected"), [(7e9, 3), (1e9, 1), (float("inf"), 8)])
+@pytest.mark.parametrize(("left", "expected"), [(7e9, 2), (1e9, 1), (float("inf"), 8)])
 def test_simulators_fit_into_the_memory(left, expected, monkeypatch):
     monkeypatch.setattr(run_settings, "available_cores", lambda: 64)
     monkeypatch.setattr(run_settings, "memory_left", lambda: left)
-    assert run_settings.default_num_envs() == expected
+    assert run_settings.default_num_envs(find_suite("libero_10")) == expected
 
 
 #: Every class of settings whose options a command line takes.
