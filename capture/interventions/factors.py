@@ -119,6 +119,9 @@ class SiteEditor(FactorEditor):
     edits: Sequence[SiteEdit]
     #: By the edit's number and the kind of call, which are the same at every layer and denoise step.
     _operands: dict[tuple[int, object], _Operands] = field(default_factory=dict, init=False, repr=False)
+    #: Queries (batch, head, query) that a call left without keys, where that was, and by which groups. They stay on the
+    #: device until the end: a GPU would wait for each that is read.
+    _lost: list[tuple[Tensor, str, str]] = field(default_factory=list, init=False, repr=False)
 
     def change(self, layer: int, denoise_step: int | None, call: CallKeys) -> LogitChange | None:
         """See `AttentionEditor`."""
@@ -129,6 +132,12 @@ class SiteEditor(FactorEditor):
             return None
         where = f"layer {layer}, denoise step {denoise_step}"
         return self._change(numbers, call, f"the prefix's layer {layer}" if denoise_step is None else where)
+
+    def finish(self) -> None:
+        """See `AttentionEditor`."""
+        if self._lost and bool(torch.stack([lost.any() for lost, *_ in self._lost]).cpu().any()):
+            for lost, where, why in self._lost:
+                check_keys_left(lost, where, why)
 
     @property
     def changes_prefix(self) -> bool:
@@ -158,9 +167,8 @@ class SiteEditor(FactorEditor):
                     self._operands[number, kind] = _operands_of(self.edits[number], call, logits)
                 logits = _applied(self._operands[number, kind], logits)
             groups = "; ".join(self.edits[number].group for number in numbers)
-            check_keys_left(
-                had_keys & (logits.amax(-1) <= _LOWEST_LOGIT), f"site '{self.site}', {where}", f": {groups}"
-            )
+            lost = had_keys & (logits.amax(-1) <= _LOWEST_LOGIT)
+            self._lost.append((lost, f"site '{self.site}', {where}", f": {groups}"))
             return logits
 
         return change

@@ -176,6 +176,9 @@ class AttentionEditor(Protocol):
         """Return the change of a call, or None if nothing changes there; denoise_step: None in the prefix."""
         ...
 
+    def finish(self) -> None:
+        """Raise `QueryWithoutKeys` if the changes left a query without any key; called once, after the model."""
+
 
 class FactorEditor(AttentionEditor, Protocol):
     """An editor that multiplies weights before normalising, the same at all layers, heads and denoise steps."""

@@ -219,3 +219,6 @@ class _Everywhere:
     def change(self, layer: int, denoise_step: int | None, call: CallKeys) -> LogitChange:
         """See `AttentionEditor`."""
         return self.added
+
+    def finish(self) -> None:
+        """Nothing is left to do: it holds factors alone."""

@@ -168,16 +168,19 @@ def test_chosen_queries_of_the_prefix():
 
 
 def test_a_query_without_keys():
-    change = change_of(factor(*[0.0] * KEYS, heads=(2,)), layer=5, step=1)
+    changes = editor(factor(*[0.0] * KEYS, heads=(2,)))
+    rows_of(changes.change(5, 1, CallKeys(slice(0, QUERIES), None)))
     with pytest.raises(
         QueryWithoutKeys, match=r"site 'joint', layer 5, denoise step 1, head 2, query 0: group. Take a"
     ):
-        rows_of(change)
+        changes.finish()
     # All allowed keys in two edits, which each leave some.
     first = factor(0, 0, 1, 0, 0, 1, 1, 1, 1)
     second = factor(1, 1, 1, 1, 1, 0, 0, 1, 0)
+    changes = editor(first, second)
+    rows_of(changes.change(0, 0, CallKeys(slice(0, QUERIES), None)))
     with pytest.raises(QueryWithoutKeys, match="query 0: group; group"):
-        rows_of(change_of(first, second))
+        changes.finish()
 
 
 def test_a_query_that_had_no_key_before_is_left_alone():
