@@ -25,7 +25,7 @@ PREFIX = "observation.images."
 
 
 def layout_of(policy: Any) -> va.PolicyLayout:
-    """Return the policy's layout; the layouts that come along have LeRobot's names."""
+    """Return the policy's layout; the layouts that are shipped have LeRobot's names."""
     return getattr(va.layouts, policy.name)(policy)
 
 

@@ -218,7 +218,7 @@ def use_newest(wheel: Path, named: list[str], folder: Path) -> None:
 
 
 def use_examples(laptop: Path, folder: Path) -> None:
-    """What a first minute has: the stores that come along, by the one name that `uvx` knows, and no torch."""
+    """What a first minute has: the stores that are shipped, by the one name that `uvx` knows, and no torch."""
     examples = folder / "example"
     shutil.rmtree(examples, ignore_errors=True)
     run(laptop / "vla-attention", "example", examples, cwd=folder, quiet=True)

@@ -87,7 +87,7 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 
 
 def example(name: str) -> Path:
-    """Return the path of a small store that comes along: `cubes`, `cubes_one_colour` or `cubes_noise`.
+    """Return the path of a small store that is shipped: `cubes`, `cubes_one_colour` or `cubes_noise`.
 
     >>> run = va.open(va.example("cubes"))
 

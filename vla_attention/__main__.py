@@ -17,7 +17,7 @@ usage: vla-attention COMMAND ...
 
 Does a vision-language-action policy look, or does it read?
 
-  example [FOLDER]   copy the small stores that come along, and say what to ask them
+  example [FOLDER]   copy the small stores that are shipped, and say what to ask them
   capture POLICY     run a policy and record its attention into a store (needs the extra [capture])
 
 questions to a store (vla-attention COMMAND STORE)

@@ -186,7 +186,7 @@ def _needs(part: Compared) -> list[Finding]:
     ]
     numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}
     text = f"the action moves by {', '.join(said)}" if said else "no item's effect is shown to differ"
-    limit = "Without a word it reads a sentence that no task has; with one exchanged, one that it was trained on."
+    limit = "Trust exchanged words more than missing ones: a sentence with a missing word is new to the policy."
     return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers, limit)]
 
 
@@ -198,7 +198,7 @@ def _attention(part: Compared) -> Finding:
         items = _largest(part.rows[kind].filter(ALL)) if kind in part.rows else groups.clear()
         for row in items.iter_rows(named=True):
             named = f"{quote}{visible(row['item'].replace('_', ' '))}{quote}"
-            said.append(f"{2.0 ** row['difference']:.2g} times as much on {named}")
+            said.append(f"{2.0 ** row['difference']:.2g} times as much attention to {named}")
     heads = part.rows["heads"].filter(ALL)
     if sure := heads.filter(_SURE).height:
         top = _largest(heads).row(0, named=True)

@@ -197,8 +197,8 @@ def _foretold(outcomes: pl.DataFrame) -> list[Finding]:
     lost, longest = frame.filter(~pl.col("solved"))["num_steps"], max(frame["num_steps"].to_list())
     always = max(solved_ones, n - solved_ones)
     said = (
-        f"The task alone, by its other episodes, tells the outcome of {right:g} of {n} episodes (always the same "
-        f"guess: {always}); {(lost == longest).sum()} of {len(lost)} failures lasted the most steps of all ({longest})."
+        f"Knowing the task alone predicts {right:g} of {n} outcomes (always guessing the more frequent one: {always}); "
+        f"{(lost == longest).sum()} of {len(lost)} failures lasted the most steps of all ({longest})."
     )
     return [Finding(said, _BEFORE, {"right": right, "n": n, "solved": solved_ones})]
 

@@ -36,7 +36,7 @@ _EXCHANGE_EXAMPLES = """\
   vla-attention capture exchange pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_goal
 """
 _DOCTOR_EXAMPLES = """\
-  vla-attention capture doctor                                    this machine, for a run of the policy that comes along
+  vla-attention capture doctor                                    this machine, for a run of the policy that is shipped
   vla-attention capture doctor pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_10
 """
 
@@ -225,7 +225,7 @@ def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:
 #: its arguments to a parser, which may go by the words that will be parsed.
 _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser, Sequence[str]], None]]] = {
     "exchange": (
-        "tell every task in the scenes of the tasks that share it: does the policy do what it is told?",
+        "put the robot into the scene of one task and tell it the sentence of another: does it do what it is told?",
         "Where tasks share a scene, begin with the initial state of one and tell the policy the sentence of another. "
         "Goals of all of them are watched; an episode ends when the told one is reached. Takes the options of a "
         "capture; --num-episodes is the number of initial states of each pair (default: 1), --task chooses the tasks. "

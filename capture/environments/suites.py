@@ -22,7 +22,7 @@ SUITES: tuple[Suite, ...] = (
     Suite("libero_90", "libero", num_tasks=90, max_steps=400, initial_states_per_task=50, simulator_bytes=3.3e9),
     Suite("robosuite", "robosuite", num_tasks=8, max_steps=200, initial_states_per_task=50, simulator_bytes=8.0e08),
     Suite("cubes", "cubes", num_tasks=17, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
-    # The same and six more tasks, which the policy that comes along was trained on and solves too seldom.
+    # The same and six more tasks, which the policy that is shipped was trained on and solves too seldom.
     Suite("cubes_harder", "cubes", num_tasks=23, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
     # For control policies (docs/validation.md): the first twelve tasks, with a mark in the picture.
     Suite("cubes_marked", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),

@@ -20,7 +20,7 @@ def policy_families() -> tuple[PolicyFamily, ...]:
 
 
 def default_family() -> PolicyFamily:
-    """Return the family of the trained policy that comes along."""
+    """Return the family of the trained policy that is shipped."""
     return next(family for family in policy_families() if any(name in family.built_in for name in family.trained_on))
 
 

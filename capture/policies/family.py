@@ -28,7 +28,7 @@ UNTRAINED_POLICIES = (UNTRAINED, UNTRAINED_TINY)
 
 def checkpoint_option(text: str, default: str = UNTRAINED, **more: Any) -> Any:
     """`--checkpoint`, the first field of a family's settings; text: what it takes besides the untrained policies."""
-    untrained = f"'{UNTRAINED}' and '{UNTRAINED_TINY}' have random weights and come along"
+    untrained = f"'{UNTRAINED}' and '{UNTRAINED_TINY}' have random weights and are shipped"
     return option(f"{text}; {untrained} (default: %(default)s)", default, group="model", metavar="PATH", **more)
 
 
@@ -58,7 +58,7 @@ class ModelSettings:
         """Raise what `build` would where a local checkpoint lacks files; loads nothing. Here nothing is known."""
 
     def refuse_for_untrained(self, *names: str) -> None:
-        """Raise `BadArgument` if options that are for checkpoints were given for a policy that comes along."""
+        """Raise `BadArgument` if options that are for checkpoints were given for a policy that is shipped."""
         defaults = {one.name: one.default for one in fields(self)}
         given = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) != defaults[name]]
         if self.dtype == "bfloat16":

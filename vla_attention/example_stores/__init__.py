@@ -1,4 +1,4 @@
-"""Small stores that come along, an archive each: `va.example("cubes")` is the path of one.
+"""Small stores that are shipped, an archive each: `va.example("cubes")` is the path of one.
 
 They are recordings of `pi05_cubes`, a pi0.5 of 1.5 million parameters for coloured cubes (docs/validation.md).
 `scripts/make_example_stores.py` makes them, and says what is in them.

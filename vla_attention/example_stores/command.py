@@ -1,4 +1,4 @@
-"""`vla-attention example`: copies of the small stores that come along, and first questions to them."""
+"""`vla-attention example`: copies of the small stores that are shipped, and first questions to them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Try:
 def main(argv: Sequence[str]) -> int:
     """Copy the stores; returns the exit code."""
     parser = OneSentenceParser(
-        prog=PROGRAM, description="Copy the small stores that come along into a folder.", epilog=_EXAMPLES
+        prog=PROGRAM, description="Copy the small stores that are shipped into a folder.", epilog=_EXAMPLES
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("example"), metavar="FOLDER", help="where to")
     folder: Path = parser.parse_args(argv).folder

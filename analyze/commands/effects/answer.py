@@ -174,7 +174,11 @@ def _sides(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> l
         f"({one[PICTURES]:.2g} and {one[TEXT]:.2g})."
     )
     mostly = items.filter(pl.col("item").is_in([PICTURES, TEXT]), pl.col("grip_part") >= _HALF)["item"].to_list()
-    said += f" Without {mostly[0] if len(mostly) == 1 else 'either'} it is mostly the gripper." if mostly else ""
+    said += (
+        f" Without {mostly[0] if len(mostly) == 1 else 'either'}, most of the change is the gripper's."
+        if mostly
+        else ""
+    )
     numbers = {"estimate": one["ratio"], "low": one["ratio_low"], "high": one["ratio_high"], "n": one["num_episodes"]}
     return [Finding(said, "Pictures or text?", numbers, enough(question))]
 
