@@ -139,8 +139,8 @@ def open_runs(arguments: Sequence[RunArgument], settings: AnalysisSettings, allo
 
 #: Entries of the provenance that affect what the policy sees; differences in others are only noted.
 _SIMULATOR = ("mujoco", "robosuite", "hf-libero", "assets")
-#: Entries that are measured anew in every episode; they say nothing about how runs were captured.
-_MEASURED = ("largest P·V error", "replan blocks without attention", "difference to own setting")
+#: Entries that are measured anew in every episode, or are the task's; they say nothing about how runs were captured.
+_MEASURED = ("task file says", "largest P·V error", "replan blocks without attention", "difference to own setting")
 #: Entries of the policy's configuration that belong to the weights.
 _NAMES_OF_WEIGHTS = ("configuration", "config_name", "statistics", "config")
 

@@ -136,7 +136,8 @@ def _add_capture_arguments(
     parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None = None
 ) -> None:
     """Add all options of a capture with one policy family; `script`: of a published script instead."""
-    names, default = ", ".join(suite.name for suite in SUITES), "a store in runs"
+    names, default = ", ".join(suite.name for suite in SUITES if not suite.perturbs), "a store in runs"
+    names += ", libero_pro_{spatial,object,goal,10}_{lan,object,swap,task}"
     seeds = ", ".join(f"{protocol.default_seed} for {protocol.name}" for protocol in family.protocols)
     suites, layers, resumed = f"one of {names}", "block indices (default: all)", ""
     if script:

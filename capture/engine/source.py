@@ -73,7 +73,7 @@ def episode_start(
         initial_state_index=job.begins_as[1] if state_index is None else state_index,
         initial_state_digest=state_digest,
         objects=objects,
-        provenance=dict(machine),
+        provenance={**machine, **({"task file says": task.file_sentence} if task.file_sentence else {})},
         task_family=task.task_family,
         scene_task_id=scene_task_id if job.scene is None else job.scene.task_id,
     )

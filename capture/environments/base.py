@@ -37,6 +37,7 @@ class Suite:
         (language-conditioned tasks on robosuite) need no download.
     max_steps: policy steps after which an episode counts as failed, as in openpi's evaluation. Other protocols may have
         other numbers (`episode_protocol.py`).
+    perturbs: of a suite of LIBERO-PRO, the suite whose tasks it changes.
     simulator_bytes: memory of one simulator in a process of its own, the most of the tasks that were measured (LIBERO's
         with its original assets), rounded up.
     """
@@ -47,6 +48,7 @@ class Suite:
     max_steps: int
     initial_states_per_task: int
     simulator_bytes: float
+    perturbs: str = ""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Task:
     instruction: the sentence that the policy gets.
     num_initial_states: number of stored initial states; an episode selects one by its index.
     task_family: the sentence template that it shares with other tasks (`task_families.py`); empty: none known.
+    file_sentence: of a task of LIBERO-PRO, what its file says: not always what is told.
     """
 
     suite: str
@@ -64,6 +67,7 @@ class Task:
     instruction: str
     num_initial_states: int
     task_family: str = ""
+    file_sentence: str = ""
 
 
 #: Name, instruction and family of a task.

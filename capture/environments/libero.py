@@ -15,6 +15,13 @@ from numpy.typing import NDArray
 from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_assets import find_assets
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
+from vla_attention.capture.environments.libero_pro import (
+    check_pro_assets,
+    own_name,
+    pro_initial_states,
+    pro_task_file,
+    register_objects,
+)
 from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
 from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.schemas.episode_steps import TaskGoal
@@ -50,9 +57,13 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
         if isinstance(error, UserError):
             raise
         raise UnusableTask(f"'{path}' holds no initial states ({error}); {install_again}.") from error
+    return _checked_states(states, f"'{path}'", install_again)
+
+
+def _checked_states(states: NDArray[np.float64], origin: str, install_again: str) -> NDArray[np.float64]:
     if states.ndim != 2 or not np.isfinite(states).all():
         raise UnusableTask(
-            f"'{path}' holds numbers of shape {states.shape}, or NaN; expected (state, number), all finite: "
+            f"{origin} holds numbers of shape {states.shape}, or NaN; expected (state, number), all finite: "
             f"{install_again}."
         )
     return states
@@ -98,9 +109,8 @@ class LiberoEnvironment(SimulatedEnvironment):
     """
 
     def __init__(self, task: Task, settings: EnvironmentSettings, suite_tasks: Sequence[Task] = ()) -> None:
-        self._assets = find_assets(settings.libero_assets)
-        stored = package_folder() / "init_files" / task.suite / f"{task.name}.pruned_init"
-        self._initial_states = load_initial_states(stored)
+        self._assets = check_pro_assets(task.suite, find_assets(settings.libero_assets))
+        self._initial_states = _states_of(task)
         if len(self._initial_states) != task.num_initial_states:
             raise BadArgument(
                 f"The installed LIBERO stores {len(self._initial_states)} initial states for '{task.name}' "
@@ -115,6 +125,8 @@ class LiberoEnvironment(SimulatedEnvironment):
 
     def _build(self, options: dict[str, Any]) -> Any:
         classes = load_libero(self._assets)
+        if own_name(self.task.suite):
+            register_objects()
         path = task_file(self.task)
         environment = look_up("problem of LIBERO", str(read_task_file(path).get("problem_name")), classes)
         # The stored state sets the robot's joints, so they need no noise.
@@ -216,8 +228,18 @@ class LiberoEnvironment(SimulatedEnvironment):
         return described, {name: [thing.root_body] for name, thing in (movable | fixed).items()}
 
 
+def _states_of(task: Task) -> NDArray[np.float64]:
+    if own_name(task.suite):
+        return _checked_states(
+            pro_initial_states(task), f"'{task.name}' of {task.suite}", "install vla-attention again"
+        )
+    return load_initial_states(package_folder() / "init_files" / task.suite / f"{task.name}.pruned_init")
+
+
 def task_file(task: Task) -> Path:
     """Return the path of the file that says what is in a task's scene, and its goal."""
+    if own_name(task.suite):
+        return pro_task_file(task)
     return package_folder() / "bddl_files" / task.suite / f"{task.name}.bddl"
 
 

@@ -60,8 +60,9 @@ def instruction_of(task_name: str) -> str:
 
 
 def list_libero_tasks(suite: Suite) -> list[TaskTexts]:
-    """Return a suite's tasks in the benchmark's default order."""
-    names = _task_names()[suite.name]
+    """Return a suite's tasks in the benchmark's default order; of LIBERO-PRO, which keeps it, those of the suite that
+    it changes."""
+    names = _task_names()[suite.perturbs or suite.name]
     if len(names) != suite.num_tasks:
         raise MissingDependency(
             f"The installed LIBERO has {len(names)} tasks in {suite.name} instead of {suite.num_tasks}; "

@@ -6,6 +6,7 @@ A new suite of an existing simulator is one line in `SUITES`. A new simulator is
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
@@ -13,12 +14,17 @@ from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, list_cube
 from vla_attention.capture.environments.robosuite_installation import find_robosuite
 from vla_attention.schemas.errors import look_up
 
-#: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`); benchmarks/README.md has the memory.
-SUITES: tuple[Suite, ...] = (
+#: LIBERO's standard suites. The numbers of steps are openpi's (see `episode_protocol.py`); benchmarks/README.md has the
+#: memory.
+_STANDARD = (
     Suite("libero_spatial", "libero", num_tasks=10, max_steps=220, initial_states_per_task=50, simulator_bytes=2.7e9),
     Suite("libero_object", "libero", num_tasks=10, max_steps=280, initial_states_per_task=50, simulator_bytes=2.7e9),
     Suite("libero_goal", "libero", num_tasks=10, max_steps=300, initial_states_per_task=50, simulator_bytes=2.3e9),
     Suite("libero_10", "libero", num_tasks=10, max_steps=520, initial_states_per_task=50, simulator_bytes=3.3e9),
+)
+#: Every suite.
+SUITES: tuple[Suite, ...] = (
+    *_STANDARD,
     Suite("libero_90", "libero", num_tasks=90, max_steps=400, initial_states_per_task=50, simulator_bytes=3.3e9),
     Suite("robosuite", "robosuite", num_tasks=8, max_steps=200, initial_states_per_task=50, simulator_bytes=8.0e08),
     Suite("cubes", "cubes", num_tasks=17, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
@@ -27,23 +33,37 @@ SUITES: tuple[Suite, ...] = (
     # For control policies (docs/validation.md): the first twelve tasks, with a mark in the picture.
     Suite("cubes_marked", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
     Suite("cubes_mark_only", "cubes", num_tasks=12, max_steps=150, initial_states_per_task=50, simulator_bytes=8.0e08),
+    # LIBERO-PRO: another sentence, another object, other places, another task.
+    *(
+        replace(suite, name=f"{suite.name.replace('libero_', 'libero_pro_')}_{kind}", perturbs=suite.name)
+        for suite in _STANDARD
+        for kind in ("lan", "object", "swap", "task")
+    ),
 )
 #: `--task-suite all` stands for these, in this order: the standard suites of LIBERO.
 ALL_SUITES = "all"
-STANDARD_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
+STANDARD_SUITES = tuple(suite.name for suite in _STANDARD)
 
 
 def find_suite(name: str) -> Suite:
-    """Return the suite of that name, or raise `UnknownName` with the names that exist."""
-    return look_up("task suite", name, {suite.name: suite for suite in SUITES})
+    """Return the suite of that name, or of LIBERO-PRO's own name, or raise `UnknownName` with the names that exist."""
+    named = {suite.name: suite for suite in SUITES}
+    own = {suite.name.replace("libero_pro_", "libero_"): suite for suite in SUITES if suite.perturbs}
+    return own.get(name) or look_up("task suite", name, named)
 
 
 def list_tasks(suite: Suite) -> tuple[Task, ...]:
     """Return the suite's tasks in order. Reads names only: needs no simulator, no assets and no torch."""
+    written = [""] * suite.num_tasks
     if suite.kind == "libero":
         from vla_attention.capture.environments.libero_installation import list_libero_tasks
 
         texts = list_libero_tasks(suite)
+        if suite.perturbs:
+            from vla_attention.capture.environments.libero_pro import pro_texts
+
+            both = [pro_texts(suite, name, told) for name, told, _ in texts]
+            texts, written = [its for its, _ in both], [says for _, says in both]
     elif suite.kind == "cubes":
         texts = list_cube_tasks(suite)
     else:
@@ -51,8 +71,8 @@ def list_tasks(suite: Suite) -> tuple[Task, ...]:
 
         texts = list_robosuite_tasks()
     return tuple(
-        Task(suite.name, number, name, instruction, suite.initial_states_per_task, family)
-        for number, (name, instruction, family) in enumerate(texts)
+        Task(suite.name, number, name, instruction, suite.initial_states_per_task, family, says)
+        for number, ((name, instruction, family), says) in enumerate(zip(texts, written, strict=True))
     )
 
 
@@ -83,14 +103,15 @@ def check_installed(suite: Suite, libero_assets: Path | None) -> None:
 
     Raises:
         MissingDependency: robosuite or LIBERO is not installed.
-        LiberoAssetsMissing: no folder has all of LIBERO's assets.
+        LiberoAssetsMissing: no folder has all of LIBERO's assets, or those of LIBERO-PRO.
     """
     find_robosuite()
     if suite.kind == "libero":
         from vla_attention.capture.environments.libero_assets import find_assets
+        from vla_attention.capture.environments.libero_pro import check_pro_assets
 
         list_tasks(suite)
-        find_assets(libero_assets)
+        check_pro_assets(suite.name, find_assets(libero_assets))
 
 
 def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) -> Environment:

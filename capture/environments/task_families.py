@@ -9,7 +9,13 @@ from __future__ import annotations
 import re
 
 #: Expressions that mean the same are one template.
-_SAME = (("on top of", "on"), ("and put it", "and place it"), ("and put the bowl inside", "and put the bowl in it"))
+_SAME = (
+    ("on top of", "on"),
+    ("and put it", "and place it"),
+    ("and put the bowl inside", "and put the bowl in it"),
+    ("and put the cream cheese inside", "and put the cream cheese in it"),
+    ("pick the", "pick up the"),
+)
 #: The templates of LIBERO's suites and of robosuite's tasks. The first one that fits is the family, so that those with
 #: a second clause stand before those without.
 TEMPLATES = (

@@ -46,7 +46,7 @@ def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy:
     if evaluation != policy.default_protocol and evaluation.replan_steps is not None:
         replan_steps = evaluation.replan_steps
     suite = settings.suite
-    published_steps = evaluation.max_steps.get(suite.name, suite.max_steps)
+    published_steps = evaluation.max_steps.get(suite.perturbs or suite.name, suite.max_steps)
     return Protocol(
         suite=suite.name,
         seed=evaluation.default_seed if settings.seed is None else settings.seed,

@@ -17,6 +17,7 @@ from vla_attention.capture.environments.base import Suite
 from vla_attention.capture.environments.drawing import check_drawing
 from vla_attention.capture.environments.libero_assets import compare_with_originals, find_assets
 from vla_attention.capture.environments.libero_installation import package_folder
+from vla_attention.capture.environments.libero_pro import check_pro_assets
 from vla_attention.capture.environments.robosuite_installation import DEFAULT_GL, find_robosuite
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.machine import memory_limits
@@ -56,7 +57,7 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
     look("robosuite", _find_robosuite)
     if suite.kind == "libero":
         look("LIBERO", lambda: _find_libero(suite))
-        look("assets", lambda: find_libero_assets(find_assets(assets)))
+        look("assets", lambda: find_libero_assets(check_pro_assets(suite.name, find_assets(assets))))
     if missing:
         look("drawing", lambda: ("note", "Not tried before what is missing is there."))
     else:

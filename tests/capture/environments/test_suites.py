@@ -13,8 +13,11 @@ SETTINGS = EnvironmentSettings()
 
 
 def test_published_protocol_numbers() -> None:
-    known = {suite.name: (suite.num_tasks, suite.max_steps) for suite in SUITES if suite.kind == "libero"}
-    assert known == {
+    steps = {suite.name: (suite.num_tasks, suite.max_steps) for suite in SUITES if suite.kind == "libero"}
+    perturbed = [suite for suite in SUITES if suite.perturbs]
+    assert len(perturbed) == 16
+    assert all(steps.pop(suite.name) == steps[suite.perturbs] for suite in perturbed)
+    assert steps == {
         "libero_spatial": (10, 220),
         "libero_object": (10, 280),
         "libero_goal": (10, 300),
