@@ -7,7 +7,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.commands.compare_tables import ALL, figures_of, tables_of
+from vla_attention.analyze.commands.compare_tables import ALL, figures_of, perturbed, tables_of
 from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
@@ -73,7 +73,10 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
     cells, groups = by_themselves(base, rest, sampling)
     columns = [column for column in _RUNS if column.name in cells.columns]
     whole = (pl.col("layer") == LAYERS_AVG) & (pl.col("scope") != "task")
-    tables += [*tables_of(parts, told), Table("runs", cells, columns, "Each run", whole), Table("runs_groups", groups)]
+    by_change, of_changes = perturbed(base, parts, told)
+    findings = [*by_change, *findings]
+    tables += [*of_changes, *tables_of(parts, told)]
+    tables += [Table("runs", cells, columns, "Each run", whole), Table("runs_groups", groups)]
     figures = [figure for part in parts for figure in figures_of(part, told)]
     return Result("What changed between runs", about, findings, tables, figures, [*of_pairs, *allowed, *beside])
 

@@ -350,7 +350,8 @@ def differences_unpaired(
                 | {"mean_first": one.mean_second, "mean_other": one.mean_first, "difference": one.difference.value}
                 | {"difference_low": low, "difference_high": high, "difference_p": one.difference.p_value(0.0)}
             )
-        frame = pl.DataFrame(rows, infer_schema_length=None)
+        bounds = dict.fromkeys(("difference_low", "difference_high", "difference_p"), pl.Float64)
+        frame = pl.DataFrame(rows, infer_schema_length=None, schema_overrides=bounds) if rows else pl.DataFrame()
         return with_q(frame, "difference", of).with_columns(paired=pl.lit(False)) if rows else frame
 
     return _by_scope(both, item, looks, rows_of)

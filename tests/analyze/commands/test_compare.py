@@ -148,6 +148,32 @@ def test_a_run_of_several_stores_is_compared_suite_by_suite(stores):
     assert of_ratio.filter(scope="all")["num_tasks"].to_list() == [8]
 
 
+def test_what_libero_pro_changed_is_told_apart_and_paired_where_states_are_shared(tmp_path):
+    goal, lan, one_task = "libero_goal", "libero_pro_goal_lan", {"tasks": (0,), "episodes": 1}
+    specs = {
+        "base": replace(PLAIN, suite=goal), "lan": replace(PLAIN, suite=lan),
+        "tuned": replace(PLAIN, suite=lan, policy="tuned"),
+        "few": replace(PLAIN, suite=goal, **one_task), "few_object": replace(PLAIN, suite=f"{goal}_object", **one_task),
+    }  # fmt: skip
+    stores = {name: write_store(tmp_path / f"{name}.zarr", spec=spec) for name, spec in specs.items()}
+    words = [f"old={stores['base']},{stores['lan']}", f"new={stores['tuned']}"]
+    found = compare(open_runs(parse_runs(words), AnalysisSettings()), ("suite",))
+    rows = found["perturbations"].select("kind", "run", "num_episodes", "pairs", "solved").rows()
+    solved = [item.episode.attributes.success for item in opened(stores, "base", "tuned")[0].question.selected]
+    share = sum(solved) / len(solved)
+    assert rows == [
+        ("nothing", "old", 16, None, share), ("the sentence", "old", 16, None, share),
+        ("the sentence", "new", 16, 16, share),
+    ]  # fmt: skip
+    assert not found.findings[0].limit
+    found = compare(opened(stores, "base", "lan", allowed=("suite",)), ("suite",))
+    assert found["perturbations"]["pairs"].to_list() == [None, 0]
+    assert found.findings[0].limit.startswith("Not paired")
+    # Without an interval anywhere, and without LIBERO-PRO.
+    found = compare(opened(stores, "few", "few_object", allowed=("suite",)), ("suite",))
+    assert "perturbations" not in [table.name for table in found.tables]
+
+
 def test_layers_named_in_two_ways_are_one_block(tmp_path):
     small = replace(PLAIN, tasks=(0,), episodes=2, num_layers=18)
     path = write_store(tmp_path / "labelled.zarr", spec=replace(small, plant_rows=planting(1), layer_labels=(18, 19)))
