@@ -134,8 +134,8 @@ def check_pro_assets(suite: str, assets: Path) -> Path:
     absent = [name for name in _OBJECTS if name not in there]
     if absent and own_name(suite) and suite.endswith("_object"):
         raise LiberoAssetsMissing(
-            f"The assets in '{assets}' lack {listing(absent)}, objects of LIBERO-PRO in {suite}. The wheels have them: "
-            f"{INSTALL_LIBERO_ASSETS}; then leave out --libero-assets."
+            f"The assets in '{assets}' lack {listing(absent, 3)}, objects of LIBERO-PRO in {suite}. The wheels have "
+            f"them: {INSTALL_LIBERO_ASSETS}; then leave out --libero-assets."
         )
     return assets
 

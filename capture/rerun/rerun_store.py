@@ -54,6 +54,7 @@ def job_of(base: Store, episode: StoredEpisode) -> EpisodeJob:
         instruction=attributes.instruction,
         num_initial_states=0,
         task_family=attributes.task_family,
+        file_sentence=attributes.provenance.get("task file says", ""),
     )
     return EpisodeJob(task, attributes.episode_index, attributes.num_replans, episode.name)
 
