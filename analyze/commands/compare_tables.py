@@ -12,7 +12,7 @@ from vla_attention.analyze.core.compared import KINDS, Compared, RunValues, side
 from vla_attention.analyze.core.object_shares import CLASSES
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
-from vla_attention.schemas.errors import shortened
+from vla_attention.schemas.errors import plural, shortened
 from vla_attention.schemas.safe_text import visible
 
 ALL = pl.col("scope") == "all"
@@ -82,7 +82,7 @@ def perturbed(
         return [], []
     table = table.with_columns(pl.col("kind").fill_null("nothing"))
     said = [
-        f"{row['kind']} ({row['run']}): {row['num_episodes']} episodes, "
+        f"{row['kind']} ({row['run']}): {plural(row['num_episodes'], 'episode')}, "
         + ", ".join(how.format(row[name]) for name, how in _SAID.items() if row[name] is not None)
         for row in table.iter_rows(named=True)
     ]
