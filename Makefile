@@ -106,7 +106,7 @@ libero-assets: .venv/libero-assets-installed
 
 # All 130 tasks of LIBERO, with its original assets: half an hour, 3 GB of memory.
 test-libero: libero-assets
-	$(BIN)/pytest --thorough tests/capture/environments/test_every_libero_task.py $(ARGS)
+	$(BIN)/pytest --thorough tests/capture/environments/test_every_libero_task.py tests/capture/environments/test_libero_pro.py $(ARGS)
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
