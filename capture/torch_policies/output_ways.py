@@ -37,6 +37,8 @@ _FOLDS = {
     "chunk", "split", "unbind", "narrow", "select", "index_select", "getitem", "flip", "roll", "gather",
     "take_along_dim",
 }  # fmt: skip
+#: What is replayed in their place: the output of the replay may lie otherwise in memory than the call's.
+_RESHAPES = {"view": Tensor.reshape, "view_as": Tensor.reshape_as}
 _SUMS = {"add", "radd", "iadd", "sub", "rsub", "isub", "addcmul"}
 _MATRIX_PRODUCTS = {"linear", "matmul", "bmm", "mm", "einsum", "rmatmul", "conv1d"}
 _PRODUCTS = {"mul", "rmul", "imul"} | _MATRIX_PRODUCTS
@@ -370,7 +372,7 @@ class _Call:
         first = (self.first, *self.args[1:]) if self.in_place and id(self.args[0]) not in linear else self.args
         given, form = pytree.tree_flatten((first, dict(self.kwargs)))
         given = [_Followed(linear[id(value)]) if id(value) in linear else value for value in given]
-        function, in_place = self.function, self.in_place
+        function, in_place = _RESHAPES.get(self.name, self.function), self.in_place
 
         def replay(output: Tensor) -> Tensor:
             values = [_filled(value, output) for value in given]

@@ -115,7 +115,7 @@ class ReplanContributions:
         owners = torch.ones(len(total), device=total.device)
         if len(mixed) > 1:
             owners = ((given[most, places] - given[-1, places]) * total).sum(-1) / total.square().sum(-1)
-            if float((owners - owners.round()).abs().amax()) > _MIXED:
+            if len(owners) and float((owners - owners.round()).abs().amax()) > _MIXED:
                 raise NotReplayed("what is added to one row of the batch comes from several of them", mixes_rows=True)
         count, grams = len(range(*queries.indices(shape.queries))), []
         for number, parts in enumerate(mixed, start=1):

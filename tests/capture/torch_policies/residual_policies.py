@@ -104,7 +104,7 @@ class Block(nn.Module):
             for linear, given in ((self.query, normed), (self.key, both), (self.value, both))
         )
         mixed = functional.scaled_dot_product_attention(q, k, v)
-        folded = mixed.transpose(1, 2).flatten(2)
+        folded = mixed.transpose(1, 2).contiguous().view(len(mixed), -1, HEADS * DIM)
         rows = None
         if self.kept is not None:
             rows = ((q.float() @ k.float().transpose(2, 3)) / DIM**0.5).softmax(-1)

@@ -197,13 +197,14 @@ class Multihead(nn.Module):
         return tokens + self.dropout(update) * self.gate
 
 
-@pytest.mark.parametrize("batch_first", [True, False])
-def test_attention_that_projects_its_output_itself(tmp_path, batch_first):
+@pytest.mark.parametrize(("batch_first", "size"), [(True, 1), (False, 1), (False, 0)])
+def test_attention_that_projects_its_output_itself(tmp_path, batch_first, size):
+    # Values of 0 add nothing, as in the first block of ACT where its biases are 0.
     torch.manual_seed(0)
     policy = nn.Module()
     policy.block = Multihead(batch_first)
     policy.eval()
-    tokens, memory = torch.randn(2, ACTIONS, WIDTH), torch.randn(2, 10, WIDTH)
+    tokens, memory = torch.randn(2, ACTIONS, WIDTH), size * torch.randn(2, 10, WIDTH)
 
     def act():
         given = (tokens, memory) if batch_first else (tokens.transpose(0, 1), memory.transpose(0, 1))
