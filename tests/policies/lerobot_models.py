@@ -1,9 +1,11 @@
-"""Small random policies of LeRobot 0.4.4's real classes. Import `stand_in_torchvision` and install it first."""
+"""Small random policies of the real classes of LeRobot 0.4.4 and 0.6.1. Install `stand_in_torchvision` first."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType, ModuleType, SimpleNamespace
 from typing import Any
@@ -20,6 +22,7 @@ from lerobot.utils.constants import (
 
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 
+IS_04 = version("lerobot").startswith("0.4.")
 CAMERAS = ("top", "wrist")
 STATE_DIM, ACTION_DIM = 6, 4
 #: Sizes that a builder is not given are those of the tests.
@@ -37,6 +40,12 @@ def features(height: int, width: int, cameras: tuple[str, ...] = CAMERAS) -> dic
         "output_features": {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))},
         "device": "cpu",
     }
+
+
+def environment_features() -> dict[str, Any]:
+    """Return the same as an environment of LeRobot says it."""
+    given = features(48, 64)
+    return given["input_features"] | given["output_features"]
 
 
 def observation(
@@ -77,6 +86,21 @@ def chunk_of(policy: Any, seed: int = 0) -> Any:
         return policy.predict_action_chunk(dict(batch))
 
     return call
+
+
+@contextmanager
+def own_transformers() -> Iterator[None]:
+    """Answer the check of LeRobot 0.4 for a transformers of its own; 0.6 has none."""
+    if not IS_04:
+        yield
+        return
+    check = ModuleType("transformers.models.siglip.check")
+    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
+    with (
+        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
+        mock.patch("transformers.models.siglip.check", check, create=True),
+    ):
+        yield
 
 
 def small_smolvla(
@@ -144,8 +168,8 @@ def small_xvla(**changes: Any) -> Any:
     }
     torch.manual_seed(0)
     policy = XVLAPolicy(XVLAConfig(**{**settings, **changes})).eval()
-    # The class leaves it as the memory was.
-    torch.nn.init.normal_(policy.model.vlm.image_projection, std=0.2)
+    if hasattr(policy.model.vlm, "image_projection"):  # LeRobot 0.4 leaves it as the memory was
+        torch.nn.init.normal_(policy.model.vlm.image_projection, std=0.2)
     return policy
 
 
@@ -173,9 +197,6 @@ def small_pi0_fast(sizes: Mapping[str, int] = NONE, picture: int = 56, **changes
     from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
     from transformers import PaliGemmaConfig
 
-    check = ModuleType("transformers.models.siglip.check")
-    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
-
     def configuration() -> Any:
         vision = {
             **{"model_type": "siglip_vision_model", "hidden_size": 32, "intermediate_size": 48},
@@ -194,11 +215,10 @@ def small_pi0_fast(sizes: Mapping[str, int] = NONE, picture: int = 56, **changes
         **{"n_action_steps": 3, "chunk_size": 3, "max_decoding_steps": 5, "tokenizer_max_length": 9},
         **{"image_resolution": (picture, picture)},
     }
-    tokenizer = SimpleNamespace(bos_token_id=2)
+    tokenizer = SimpleNamespace(bos_token_id=2, convert_tokens_to_ids=lambda token: 2)
     torch.manual_seed(0)
     with (
-        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
-        mock.patch("transformers.models.siglip.check", check, create=True),
+        own_transformers(),
         mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration}),
         mock.patch.object(module, "get_gemma_config", return_value=module.GemmaConfig(**language)),
         mock.patch("transformers.AutoProcessor.from_pretrained", return_value=tokenizer),
@@ -292,6 +312,52 @@ def small_groot(
         return GrootPolicy(GrootConfig(**settings)).eval()
 
 
+def small_groot_n17(
+    width: int, heads: int, dim: int, chunk: int, steps: int, image_token: int, blocks: int
+) -> tuple[Any, Any]:
+    """LeRobot 0.6's GR00TN17 on a small Qwen3-VL, and its call: of ids (1, token), or of ids and a state."""
+    from lerobot.policies.groot import groot_n1_7 as module
+    from transformers import Qwen3VLConfig
+
+    text = {
+        **{"hidden_size": width, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2},
+        **{"num_key_value_heads": 1, "head_dim": 8, "vocab_size": 110, "max_position_embeddings": 64},
+        "rope_parameters": {"rope_type": "default", "rope_theta": 1e4, "mrope_section": [2, 1, 1]},
+    }
+    vision = {
+        **{"depth": 1, "hidden_size": 16, "intermediate_size": 24, "num_heads": 2, "out_hidden_size": width},
+        **{"patch_size": 2, "spatial_merge_size": 2, "temporal_patch_size": 2, "num_position_embeddings": 16},
+        "deepstack_visual_indexes": [0],
+    }
+    tokens = {"image_token_id": image_token, "video_token_id": 99, "vision_start_token_id": 15}
+    vlm = Qwen3VLConfig(text_config=text, vision_config=vision, vision_end_token_id=97, **tokens)
+    transformer = {"num_attention_heads": heads, "attention_head_dim": dim, "dropout": 0.0, "final_dropout": True}
+    config = module.GR00TN17Config(
+        **{"backbone_embedding_dim": width, "hidden_size": width, "input_embedding_dim": heads * dim},
+        **{"action_horizon": chunk, "max_action_dim": 4, "max_state_dim": 6, "max_num_embodiments": 2},
+        **{"num_inference_timesteps": steps, "select_layer": 2, "max_seq_len": 16},
+        diffusion_model_cfg={
+            **transformer,
+            **{"num_layers": blocks, "output_dim": width, "interleave_self_attention": True},
+            **{"norm_type": "ada_norm", "positional_embeddings": None},
+        },
+        vl_self_attention_cfg={**transformer, "num_layers": 1, "positional_embeddings": None},
+    )
+    torch.manual_seed(0)
+    with mock.patch.object(module, "_cosmos_reason2_qwen3_vl_config", return_value=vlm):
+        policy = module.GR00TN17(config, load_backbone_weights=False).float().eval()
+    pictures = torch.rand(16, 3 * 2 * 2 * 2, generator=torch.Generator().manual_seed(1))
+
+    def call(observation: Any) -> torch.Tensor:
+        ids, state = observation if isinstance(observation, tuple) else (observation, torch.ones(1, 1, 6))
+        torch.manual_seed(0)
+        given = {"input_ids": ids, "attention_mask": torch.ones_like(ids), "pixel_values": pictures}
+        given |= {"image_grid_thw": torch.tensor([[1, 4, 4]]), "state": state}
+        return policy.get_action({**given, "embodiment_id": torch.zeros(1, dtype=torch.long)})["action_pred"]
+
+    return policy, call
+
+
 def groot_observation(patches: int = 4) -> dict[str, torch.Tensor]:
     """Return a preprocessed observation of two pictures, each a row of squares of two pixels, and the instruction."""
     picture = [98] * patches
@@ -319,9 +385,6 @@ def small_pi0_lerobot(**changes: Any) -> Any:
     from lerobot.policies.pi0.configuration_pi0 import PI0Config
     from transformers import GemmaConfig, PaliGemmaConfig
 
-    check = ModuleType("transformers.models.siglip.check")
-    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
-
     def configuration() -> Any:
         vision = {
             **{"model_type": "siglip_vision_model", "hidden_size": 32, "intermediate_size": 48},
@@ -338,8 +401,7 @@ def small_pi0_lerobot(**changes: Any) -> Any:
     }
     torch.manual_seed(0)
     with (
-        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
-        mock.patch("transformers.models.siglip.check", check, create=True),
+        own_transformers(),
         mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration, "gemma": GemmaConfig}),
         mock.patch.object(module, "get_gemma_config", return_value=sizes),
     ):
@@ -377,8 +439,8 @@ class FinalNorm(AdaptiveNorm):
 def small_pi05_lerobot(config: Any, state: Mapping[str, torch.Tensor]) -> Any:
     """LeRobot's PI05Pytorch with the sizes and weights of a `PiModel`; cameras: those of `config`.
 
-    Its transformers has other Gemma layers: adaptive norms, `_gated_residual`, no factor before the first layer. They
-    are put in here, written after openpi's transformers_replace/models/gemma/modeling_gemma.py.
+    The transformers of 0.4 has other Gemma layers: adaptive norms, `_gated_residual`, no factor before the first layer.
+    They are put in here, written after openpi's transformers_replace/models/gemma/modeling_gemma.py. 0.6 has its own.
     """
     from copy import deepcopy
 
@@ -413,8 +475,6 @@ def small_pi05_lerobot(config: Any, state: Mapping[str, torch.Tensor]) -> Any:
             part.width, part.depth, part.mlp_dim, part.num_heads, part.num_kv_heads, part.head_dim
         )
 
-    check = ModuleType("transformers.models.siglip.check")
-    check.check_whether_transformers_replace_is_installed_correctly = lambda: True  # type: ignore[attr-defined]
     settings = PI05Config(
         **features(vision.image_size, vision.image_size, config.cameras),
         n_action_steps=config.action_horizon,
@@ -425,8 +485,7 @@ def small_pi05_lerobot(config: Any, state: Mapping[str, torch.Tensor]) -> Any:
         max_action_dim=config.action_dim,
     )
     with (
-        mock.patch.dict(sys.modules, {"transformers.models.siglip.check": check}),
-        mock.patch("transformers.models.siglip.check", check, create=True),
+        own_transformers(),
         mock.patch.object(module, "CONFIG_MAPPING", {"paligemma": configuration, "gemma": GemmaConfig}),
         mock.patch.object(
             module, "get_gemma_config", side_effect=[sizes_of(config.paligemma), sizes_of(config.action_expert)]
@@ -436,13 +495,14 @@ def small_pi05_lerobot(config: Any, state: Mapping[str, torch.Tensor]) -> Any:
     networks = policy.paligemma_with_expert
     inner, expert = networks.paligemma.model, networks.gemma_expert.model
     inner.multi_modal_projector.linear = torch.nn.Linear(vision.width, config.paligemma.width)
-    final = expert.norm = FinalNorm(width)
-    for layer in expert.layers:
-        layer.__class__ = Layer
-        layer.input_layernorm, layer.post_attention_layernorm = AdaptiveNorm(width), AdaptiveNorm(width)
-    # The factors on embeddings and picture features, which openpi's transformers leaves out.
-    for part in (inner.language_model.config, inner.config.text_config, expert.config):
-        part.hidden_size = 1
+    if IS_04:
+        final = expert.norm = FinalNorm(width)
+        for layer in expert.layers:
+            layer.__class__ = Layer
+            layer.input_layernorm, layer.post_attention_layernorm = AdaptiveNorm(width), AdaptiveNorm(width)
+        # The factors on embeddings and picture features, which openpi's transformers leaves out.
+        for part in (inner.language_model.config, inner.config.text_config, expert.config):
+            part.hidden_size = 1
     own = policy.denoise_step
     policy.denoise_step = lambda past_key_values, **given: own(past_key_values=deepcopy(past_key_values), **given)
     names = dict(policy.named_parameters())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerobot")
+pytest.importorskip("lerobot.policies.groot.groot_n1", reason="run by make test-policies, in .venv-lerobot")
 
 import vla_attention as va
 from tests.policies import lerobot_models as models

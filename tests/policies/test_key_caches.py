@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("transformers", minversion="5.0", reason="run by make test-policies, in .venv-transformers")
+pytest.importorskip("transformers", minversion="5.6", reason="run by make test-policies, in .venv-transformers")
 
 import torch
 from transformers import Gemma3ForCausalLM, Gemma3TextConfig, LlamaConfig, LlamaForCausalLM

@@ -1,4 +1,4 @@
-"""Data sets that LeRobot 0.4.4 itself wrote: read without it, and replayed with its SmolVLA."""
+"""Data sets of version 3.0 that LeRobot itself wrote: read without it, and replayed with its SmolVLA."""
 
 from __future__ import annotations
 

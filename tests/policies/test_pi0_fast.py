@@ -1,4 +1,4 @@
-"""pi0-FAST of LeRobot 0.4.4: the real class with small random weights.
+"""pi0-FAST of LeRobot: the real class with small random weights.
 
 The class asks for LeRobot's own transformers, which this environment does not have; that check is answered. What that
 version changes (Gemma's norms for pi0.5, the scale of picture features) is not in the attention that is recorded here.

@@ -1,4 +1,4 @@
-"""pi0 of LeRobot 0.4.4, whose network is openpi's PyTorch code, and openpi's websocket server with it."""
+"""pi0 of LeRobot, whose network is openpi's PyTorch code, and openpi's websocket server with it."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("transformers", minversion="5.0", reason="run by make test-policies, in .venv-transformers")
+pytest.importorskip("transformers", minversion="5.6", reason="run by make test-policies, in .venv-transformers")
 
 import torch
 

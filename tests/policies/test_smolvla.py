@@ -1,4 +1,4 @@
-"""SmolVLA of LeRobot 0.4.4: the real class with small random weights."""
+"""SmolVLA of LeRobot: the real class with small random weights."""
 
 from __future__ import annotations
 

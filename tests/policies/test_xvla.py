@@ -1,4 +1,4 @@
-"""X-VLA of LeRobot 0.4.4: the real class with small random weights."""
+"""X-VLA of LeRobot: the real class with small random weights."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ There is no text: ACT reads no instruction, and ratios of vision to language are
 
 from __future__ import annotations
 
-from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, camera_name
+from vla_attention.capture.torch_policies.layouts.layout_building import LEROBOT, FoundModule, KeyOrder, camera_name
 from vla_attention.capture.torch_policies.policy_layout import CameraPicture, PolicyLayout
 
 _NAME = "act"
@@ -50,5 +50,5 @@ def act(policy: object) -> PolicyLayout:
         cameras=tuple(CameraPicture(camera) for camera in cameras),
         action_horizon=config.chunk_size,
         action_dim=config.action_feature.shape[0],
-        versions={"lerobot": ("0.4.",)},
+        versions=LEROBOT,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, camera_name
+from vla_attention.capture.torch_policies.layouts.layout_building import LEROBOT, FoundModule, KeyOrder, camera_name
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, PromptText
 from vla_attention.schemas.errors import BadArgument
 
@@ -96,7 +96,7 @@ def pi0_fast(policy: object) -> PolicyLayout:
         action_dim=config.action_feature.shape[0],
         autoregressive=True,
         num_action_tokens=config.max_decoding_steps,
-        versions={"lerobot": ("0.4.",)},
+        versions=LEROBOT,
     )
 
 

@@ -11,6 +11,7 @@ import re
 from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    LEROBOT,
     FoundModule,
     KeyOrder,
     NotThisPolicy,
@@ -73,7 +74,7 @@ def smolvla(policy: object) -> PolicyLayout:
         text=PromptText(("prompt",), f"{expert}.vlm.model.text_model.embed_tokens"),
         action_horizon=config.chunk_size,
         action_dim=config.action_feature.shape[0],
-        versions={"lerobot": ("0.4.",)},
+        versions=LEROBOT,
     )
 
 

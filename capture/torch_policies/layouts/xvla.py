@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    LEROBOT,
     FoundModule,
     KeyOrder,
     NotThisPolicy,
@@ -18,6 +19,8 @@ from vla_attention.capture.torch_policies.layouts.layout_building import (
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, PromptText
 
 _NAME = "xvla"
+#: Those of transformers' own Florence 2, which LeRobot 0.6 has and whose configuration does not name them.
+_SOURCES = ("spatial_avg_pool", "temporal_avg_pool")
 
 
 def xvla(policy: object) -> PolicyLayout:
@@ -30,7 +33,9 @@ def xvla(policy: object) -> PolicyLayout:
         NotThisPolicy: no XVLAPolicy, or one with other picture features than means and patches.
     """
     found = FoundModule(policy, ("XVLAPolicy",), _NAME)
-    config, vision = found.module.config, found.module.model.vlm.config.vision_config
+    config, vlm = found.module.config, found.module.model.vlm
+    vision = vlm.config.vision_config
+    language = "model.vlm.language_model" + (".model" if hasattr(vlm.language_model, "model") else "")
     cameras = [(camera_name(feature), config.image_features[feature].shape) for feature in config.image_features]
     views = max(config.num_image_views or 0, len(cameras))
     keys = KeyOrder()
@@ -40,7 +45,7 @@ def xvla(policy: object) -> PolicyLayout:
             _add_view(keys, *cameras[number], config, vision)
         else:
             rows, columns = _patches(*_picture_size(cameras[0][1], config), vision)
-            count = sum(_tokens_of(source, rows * columns) for source in vision.image_feature_source)
+            count = sum(_tokens_of(source, rows * columns) for source in _sources(vision))
             keys.add(f"empty_view_{number}", "image", count, "blank")
         if number == 0:
             keys.add("prompt", "text", config.tokenizer_max_length, "instruction")
@@ -57,10 +62,10 @@ def xvla(policy: object) -> PolicyLayout:
         "pad_left_top" if config.resize_imgs_with_padding else "stretch",
         num_denoise_steps=max(1, config.num_denoising_steps),
         denoise_times=tuple(step / config.num_denoising_steps for step in range(config.num_denoising_steps, 0, -1)),
-        text=PromptText(("prompt",), found.inside("model.vlm.language_model.model.shared")),
+        text=PromptText(("prompt",), found.inside(f"{language}.shared")),
         action_horizon=config.chunk_size,
         action_dim=found.module.model.dim_action,
-        versions={"lerobot": ("0.4.",)},
+        versions=LEROBOT,
     )
 
 
@@ -76,6 +81,10 @@ def _patches(height: int, width: int, vision: Any) -> tuple[int, int]:
     return height, width
 
 
+def _sources(vision: Any) -> tuple[str, ...]:
+    return tuple(getattr(vision, "image_feature_source", _SOURCES))
+
+
 def _tokens_of(source: str, patches: int) -> int:
     counts = {"spatial_avg_pool": 1, "temporal_avg_pool": patches, "last_frame": patches}
     if source not in counts:
@@ -86,11 +95,11 @@ def _tokens_of(source: str, patches: int) -> int:
 def _add_view(keys: KeyOrder, camera: str, shape: tuple[int, ...], config: Any, vision: Any) -> None:
     height, width = _picture_size(shape, config)
     rows, columns = _patches(height, width, vision)
-    sources = [(source, _tokens_of(source, rows * columns)) for source in vision.image_feature_source]
+    sources = [(source, _tokens_of(source, rows * columns)) for source in _sources(vision)]
     if sum(source != "spatial_avg_pool" for source, _ in sources) != 1:
         raise NotThisPolicy(
             f"The layout '{_NAME}' is for one token a patch; this policy's picture features are "
-            f"{', '.join(vision.image_feature_source)}."
+            f"{', '.join(_sources(vision))}."
         )
     for source, count in sources:
         if source == "spatial_avg_pool":
