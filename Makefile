@@ -5,7 +5,8 @@
 #   make test        the gate: formatting, types, tests, and the package as others install it; minutes by part
 #   make test-thorough   attacks, damages, kills, memory, many examples, site and notebooks too (an hour or more)
 #   make faults      twenty faults planted one at a time: the tests of their area have to catch each
-#   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
+#   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot,
+#                    and .venv-lerobot06 of 6 GB, where there is a Python 3.12)
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
 #   make test-numpy1 recorder, stores and analysis with numpy 1.26, in an environment of its own (.venv-numpy1)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
@@ -41,12 +42,15 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt
 SOURCES := vla_attention schemas capture analyze tests benchmarks scripts examples
 
+# The first that runs: a shim of pyenv is on PATH also where it does not.
+PYTHON312 ?= $(shell for python in python3.12 ~/.pyenv/versions/3.12*/bin/python /opt/*/bin/python3.12; do $$python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null && echo $$python && break; done)
+
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
 WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: libero-assets capture analyze test test-policies test-remote test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: libero-assets capture analyze test test-policies test-remote test-policies-lerobot06 test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -88,11 +92,15 @@ package-newest: .venv/capture-installed
 test-numpy1: .venv-numpy1/installed
 	.venv-numpy1/bin/pytest tests/schemas tests/analyze tests/capture/torch_policies tests/capture/recording tests/capture/store tests/kit $(ARGS)
 
-# Layouts of policies on small random models of the real classes. Neither environment fits scripts/constraints.txt, nor the other:
-# transformers 5 and LeRobot 0.4.4 want different versions of the same libraries.
+# Layouts of policies on small random models of the real classes. No environment fits scripts/constraints.txt, nor another:
+# transformers 5, LeRobot 0.4.4 and 0.6.1 want different versions of the same libraries.
 test-policies: .venv-transformers/installed .venv-lerobot/installed
 	.venv-transformers/bin/pytest tests/policies $(ARGS)
 	.venv-lerobot/bin/pytest tests/policies $(ARGS)
+	$(if $(PYTHON312),$(MAKE) test-policies-lerobot06,@echo "LeRobot 0.6 is not tested: it needs Python 3.12, which is neither on PATH nor in ~/.pyenv or /opt (or name one: PYTHON312=...).")
+
+test-policies-lerobot06: .venv-lerobot06/installed
+	.venv-lerobot06/bin/pytest tests/policies $(ARGS)
 
 # moto brings fifty packages, and nothing else needs them.
 test-remote: .venv-remote/installed
@@ -181,6 +189,15 @@ setup-analyze: .venv/analyze-installed
 	$(PYTHON) -m venv .venv-lerobot
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-lerobot.txt
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps lerobot==0.4.4 av==15.0.0 openpi-client==0.1.2 openpi-server==0.1.0
+	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps ./examples/lerobot_plugin
+	@touch $@
+
+# Torch without what it asks for: not triton.
+.venv-lerobot06/installed: pyproject.toml tests/policies/requirements-lerobot06.txt $(wildcard examples/lerobot_plugin/*/*.py)
+	@echo "Installing LeRobot 0.6.1 into .venv-lerobot06 (6 GB, about ten minutes) ..."
+	$(PYTHON312) -m venv .venv-lerobot06
+	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-lerobot06.txt
+	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check --no-deps torch==2.11.0 torchvision==0.26.0 lerobot==0.6.1 av==15.1.0 ./examples/lerobot_plugin
 	@touch $@
 
 .venv-numpy1/installed: pyproject.toml
@@ -214,4 +231,4 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-notebooks .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-lerobot06 .venv-remote .venv-audit .venv-notebooks .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,7 +1,11 @@
-"""examples/lerobot_eval_recorded.py in LeRobot's own evaluation loop: a small SmolVLA, two environments at once."""
+"""examples/lerobot_plugin in LeRobot's own loop, and by the plain console command: two environments at once."""
 
 from __future__ import annotations
 
+import importlib.metadata
+import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,48 +19,21 @@ pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerob
 import gymnasium
 
 from tests.policies import lerobot_models as models
+from tests.policies.noise_environment import ENDS, NoiseEnvironment
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
-ENDS = (7, 12)
-
-
-class NoiseEnvironment(gymnasium.Env[Any, Any]):
-    """Pictures of noise; ends after a number of steps, the first environment in success."""
-
-    metadata = {"render_fps": 10}  # noqa: RUF012
-    task = task_description = INSTRUCTION
-    _max_episode_steps = 20
-
-    def __init__(self, number: int) -> None:
-        pictures = {name: gymnasium.spaces.Box(0, 255, (48, 64, 3), dtype=np.uint8) for name in models.CAMERAS}
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                "pixels": gymnasium.spaces.Dict(pictures),
-                "agent_pos": gymnasium.spaces.Box(-1, 1, (models.STATE_DIM,), dtype=np.float64),
-            }
-        )
-        self.action_space = gymnasium.spaces.Box(-1, 1, (models.ACTION_DIM,), dtype=np.float32)
-        self.number, self.count = number, 0
-
-    def _observation(self) -> dict[str, Any]:
-        numbers = np.random.default_rng([self.number, self.count])
-        return {
-            "pixels": {name: numbers.integers(0, 255, (48, 64, 3), dtype=np.uint8) for name in models.CAMERAS},
-            "agent_pos": np.full(models.STATE_DIM, self.count / 20),
-        }
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.count = 0
-        return self._observation(), {"is_success": False}
-
-    def step(self, action: Any) -> Any:
-        self.count += 1
-        ended = self.count >= ENDS[self.number]
-        success = {"is_success": bool(ended and self.number == 0)}
-        # As LeRobot's own environments say it, which also reset themselves.
-        return self._observation(), 0.0, ended, False, {**success, **({"final_info": success} if ended else {})}
+#: Of a data set: what the pictures and the state are normalised with.
+STATISTICS = {
+    name: {
+        kind: torch.full((feature.shape[0], *[1] * (len(feature.shape) - 1)), value)
+        for kind, value in (("mean", 0.5), ("std", 0.25))
+    }
+    for name, feature in models.environment_features().items()
+}
+#: The plain console command of this environment.
+COMMAND = Path(sys.executable).with_name("lerobot-eval")
 
 
 def tokenized(batch: dict[str, Any]) -> dict[str, Any]:
@@ -74,9 +51,8 @@ def lerobot_eval():
     module.rollout, module.run_one = own
 
 
-def test_two_environments_are_two_episodes_that_end_when_they_end(lerobot_eval, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[2] / "examples"), *sys.path])
-    from lerobot_eval_recorded import Recorder
+def test_two_environments_are_two_episodes_that_end_when_they_end(lerobot_eval, tmp_path):
+    from lerobot_policy_vla_attention.recorder import Recorder
 
     policy = models.small_smolvla(tmp_path / "vlm")
     recorder = Recorder(str(tmp_path / "run.zarr"), tokenizer=WordTokenizer(), untrained=True, durable=False)
@@ -112,3 +88,59 @@ def test_two_environments_are_two_episodes_that_end_when_they_end(lerobot_eval, 
     frame = store.episodes[1].read("frames/wrist")[0]
     # SmolVLA pads a picture of 48 x 64 at the top.
     np.testing.assert_array_equal(frame[16:], first)
+
+
+@pytest.fixture
+def saved_act(tmp_path):
+    """A folder as `--policy.path` takes it."""
+    if not [*importlib.metadata.distributions(name="torchvision")]:
+        pytest.skip("a command of its own has no stand-in for torchvision (.venv-lerobot06 has torchvision)")
+    from lerobot.policies.factory import make_pre_post_processors
+
+    policy = models.small_act(**models.features(48, 64))
+    policy.save_pretrained(tmp_path / "act")
+    for pipeline in make_pre_post_processors(policy.config, dataset_stats=STATISTICS):
+        pipeline.save_pretrained(tmp_path / "act")
+    return tmp_path / "act"
+
+
+def evaluated(policy: Path, store: Path, command: tuple[str | Path, ...] = (COMMAND,)) -> Any:
+    """Run lerobot-eval with the store's variable set."""
+    arguments = [
+        *(f"--policy.path={policy}", "--policy.device=cpu", f"--output_dir={store.parent / 'evaluation'}"),
+        *("--env.discover_packages_path=tests.policies.noise_environment", "--env.type=noise"),
+        *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=1000"),
+    ]
+    settings = {**os.environ, "VLA_ATTENTION_STORE": str(store), "PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.run([*command, *arguments], env=settings, capture_output=True, text=True, cwd=store.parent)
+
+
+def test_the_console_command_records_where_the_variable_names_a_store(saved_act, tmp_path):
+    done = evaluated(saved_act, tmp_path / "run.zarr")
+    assert done.returncode == 0, done.stderr[-3000:]
+    store = open_store(tmp_path / "run.zarr")
+    assert verify_store(store) == []
+    facts = [part.attributes for part in store.episodes]
+    assert [(part.success, part.num_steps) for part in facts] == [(True, ENDS[0]), (False, ENDS[1])]
+    assert [set(part.noise_seed) for part in facts] == [{1000}, {1001}]
+    reported = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
+    assert reported["overall"]["pc_success"] == 50
+    # Stored as the environment gives them, though the policy gets them normalised.
+    first = NoiseEnvironment(1)._observation()
+    np.testing.assert_array_equal(store.episodes[1].read("frames/wrist")[0], first["pixels"]["wrist"])
+    np.testing.assert_allclose(store.episodes[1].read("state")[:, 0], [0, 5 / 20, 10 / 20])
+
+
+def test_another_command_records_nothing_and_says_so(saved_act, tmp_path):
+    done = evaluated(saved_act, tmp_path / "run.zarr", (sys.executable, "-m", "lerobot.scripts.lerobot_eval"))
+    assert "lerobot_eval records nothing" in done.stdout
+    assert not (tmp_path / "run.zarr").exists()
+
+
+def test_nothing_is_evaluated_where_nothing_can_be_recorded(monkeypatch, tmp_path):
+    import lerobot_policy_vla_attention as plugin
+
+    monkeypatch.setitem(sys.modules, "lerobot_policy_vla_attention.recorder", None)
+    # LeRobot goes on after an exception of another class.
+    with pytest.raises(SystemExit, match="attention cannot be recorded"):
+        plugin.begin(str(tmp_path / "run.zarr"), "lerobot-eval")

@@ -1,19 +1,14 @@
-"""Record attention inside lerobot-eval: the same command line, with a store in front.
-
-    python lerobot_eval_recorded.py runs/smolvla_libero.zarr \\
-        --policy.path=HuggingFaceVLA/smolvla_libero --env.type=libero --env.task=libero_spatial \\
-        --eval.n_episodes=10 --eval.batch_size=5
-    vla-attention analyze runs/smolvla_libero.zarr
+"""lerobot-eval's loop with a recorder around the policy.
 
 lerobot-eval runs a batch of environments with one policy call for all of them, and the policy answers from a queue most
 of the time: `run.episodes` splits the call by row, and blocks in which no attention ran are dropped. Rows whose episode
-has ended are not recorded. Copy this file; change `layout_of` and `pictures_of` where your policy is another.
+has ended are not recorded. Change `layout_of` and `pictures_of` where your policy is another.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -22,11 +17,25 @@ from lerobot.scripts import lerobot_eval
 import vla_attention as va
 
 PREFIX = "observation.images."
+#: LeRobot's name of a policy -> its layout.
+LAYOUTS = {
+    "act": va.layouts.act,
+    "pi0": va.layouts.pi0_pytorch,
+    "pi05": va.layouts.pi0_pytorch,
+    "pi0_fast": va.layouts.pi0_fast,
+    "smolvla": va.layouts.smolvla,
+    "xvla": va.layouts.xvla,
+}
 
 
 def layout_of(policy: Any) -> va.PolicyLayout:
-    """Return the policy's layout; the layouts that are shipped have LeRobot's names."""
-    return getattr(va.layouts, policy.name)(policy)
+    """Return the layout of one of LeRobot's policies."""
+    if policy.name not in LAYOUTS:
+        raise va.UserError(
+            f"No layout is known for the policy '{policy.name}' inside lerobot-eval (known: {', '.join(LAYOUTS)}). "
+            "Add it to LAYOUTS in recorder.py; docs/my-policy.md says how to write one."
+        )
+    return LAYOUTS[policy.name](policy)
 
 
 def tokenizer_of(preprocessor: Any) -> Any:
@@ -35,9 +44,23 @@ def tokenizer_of(preprocessor: Any) -> Any:
     return next((step.input_tokenizer for step in steps if getattr(step, "input_tokenizer", None) is not None), None)
 
 
-def pictures_of(batch: dict[str, Any], row: int) -> dict[str, Any]:
-    """Return one environment's pictures by camera, (3, height, width) from 0 to 1."""
-    return {name.removeprefix(PREFIX): value[row] for name, value in batch.items() if name.startswith(PREFIX)}
+def pictures_of(observation: dict[str, Any], preprocessor: Any, row: int) -> dict[str, Any]:
+    """Return one environment's pictures, (3, height, width) from 0 to 1, by the policy's names of the cameras."""
+    steps = getattr(preprocessor, "steps", ())
+    names = next((step.rename_map for step in steps if getattr(step, "rename_map", None)), {})
+    return {
+        names.get(name, name).removeprefix(PREFIX): value[row]
+        for name, value in observation.items()
+        if name.startswith(PREFIX)
+    }
+
+
+def instructions_of(env: Any) -> list[str]:
+    """Return each environment's instruction, from where lerobot-eval has it."""
+    for name in ("task_description", "task"):
+        with suppress(AttributeError, NotImplementedError):
+            return [str(text) for text in env.call(name)]
+    return [""] * env.num_envs
 
 
 class Recorder:
@@ -68,25 +91,29 @@ class Recorder:
 
     def recorded_rollout(self, env: Any, policy: Any, *, seeds: list[int] | None = None, **arguments: Any) -> Any:
         """Run a batch of environments once, and store an episode of each."""
+        preprocessor, observed = arguments.pop("preprocessor"), {}
         if self.run is None:
-            tokenizer = tokenizer_of(arguments.get("preprocessor"))
+            tokenizer = tokenizer_of(preprocessor)
             settings = {"layout": layout_of(policy), "tokenizer": tokenizer, **self.settings}
             self.run = va.record(self.store, policy, **settings).__enter__()
-        instructions = [str(text) for text in env.call("task_description")]
         first, self.episodes = self.episodes, self.episodes + env.num_envs
         facts = [
             {"task_id": self.task, "episode_index": first + row, "instruction": text, "seed": seeds and seeds[row]}
-            for row, text in enumerate(instructions)
+            for row, text in enumerate(instructions_of(env))
         ]
         running = np.ones(env.num_envs, dtype=bool)
         steps, successes = np.zeros(env.num_envs, dtype=int), np.zeros(env.num_envs, dtype=bool)
         select, step = policy.select_action, env.step
 
+        def preprocess(observation: dict[str, Any]) -> Any:
+            # Pictures and state are stored as they are here: not normalised.
+            observed.update(observation)
+            return preprocessor(observation)
+
         def select_action(batch: dict[str, Any], **named: Any) -> Any:
-            given = {
-                "frames": [pictures_of(batch, row) for row in range(env.num_envs)],
-                "state": list(batch["observation.state"]),
-            }
+            given = {"frames": [pictures_of(observed, preprocessor, row) for row in range(env.num_envs)]}
+            if "observation.state" in observed:
+                given["state"] = list(observed["observation.state"])
             with episodes.replan(env_step=int(steps.max()), active=running.tolist(), **given):
                 return select(batch, **named)
 
@@ -94,7 +121,7 @@ class Recorder:
             result = step(actions)
             _, _, ended, cut, info = result
             steps[running] += 1
-            final = info.get("final_info", {}).get("is_success")
+            final = info.get("final_info", info).get("is_success")
             if final is not None:
                 successes[running] |= np.asarray(final, dtype=bool)[running]
             running[np.asarray(ended) | np.asarray(cut)] = False
@@ -103,14 +130,9 @@ class Recorder:
         with self.run.episodes(facts) as episodes:
             policy.select_action, env.step = select_action, count
             try:
-                result = self.rollout(env, policy, seeds=seeds, **arguments)
+                result = self.rollout(env, policy, seeds=seeds, preprocessor=preprocess, **arguments)
             finally:
                 del policy.select_action, env.step
             for episode, success, number in zip(episodes, successes, steps, strict=True):
                 episode.success, episode.num_steps = bool(success), int(number)
         return result
-
-
-if __name__ == "__main__":
-    Recorder(sys.argv.pop(1)).install()
-    lerobot_eval.main()
