@@ -6,7 +6,7 @@
 #   make test-thorough   attacks, damages, kills, memory, many examples, site and notebooks too (an hour or more)
 #   make faults      twenty faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot,
-#                    and .venv-lerobot06 of 6 GB, where there is a Python 3.12)
+#                    and .venv-lerobot06 of 5 GB, where there is a Python 3.12)
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
 #   make test-numpy1 recorder, stores and analysis with numpy 1.26, in an environment of its own (.venv-numpy1)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
@@ -192,9 +192,9 @@ setup-analyze: .venv/analyze-installed
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps ./examples/lerobot_plugin
 	@touch $@
 
-# Torch without what it asks for: not triton.
+# Torch without what it asks for, which is 0.7 GB more.
 .venv-lerobot06/installed: pyproject.toml tests/policies/requirements-lerobot06.txt $(wildcard examples/lerobot_plugin/*/*.py)
-	@echo "Installing LeRobot 0.6.1 into .venv-lerobot06 (6 GB, about ten minutes) ..."
+	@echo "Installing LeRobot 0.6.1 into .venv-lerobot06 (5 GB, about ten minutes) ..."
 	$(PYTHON312) -m venv .venv-lerobot06
 	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-lerobot06.txt
 	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check --no-deps torch==2.11.0 torchvision==0.26.0 lerobot==0.6.1 av==15.1.0 ./examples/lerobot_plugin
