@@ -128,7 +128,7 @@ audit: .venv/capture-installed .venv-audit/installed
 # Strict: a link to a page or a heading that is not there is an error; then the built pages are read for more.
 docs: .venv-docs/installed .venv/analyze-installed
 	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --quiet -f scripts/mkdocs.yml
-	$(BIN)/vla-attention view $$($(BIN)/python -c 'import vla_attention as va; print(va.example("cubes"))') --site site/explore
+	$(BIN)/vla-attention view $$($(BIN)/python -c 'from vla_attention.example_stores import *; print(*map(example, EXAMPLES))') --site site/explore
 	.venv-docs/bin/python scripts/check_site.py site
 
 pictures: .venv/analyze-installed

@@ -4,6 +4,7 @@
   and a link whose text is the name of its file gets the page's name in the list of pages.
 - `<!-- help of every command -->` becomes the help texts of the parsers, `<!-- docstring: NAME -->` the docstring of a
   public name, and `<!-- schema: NAME -->` the fields of a JSON Schema. Other readers of the Markdown see nothing there.
+- The list of pages ends with the page of the example stores.
 
 The help texts are printed by this checkout with the Python that runs mkdocs: no help text needs an installed package.
 """
@@ -49,6 +50,14 @@ def on_files(files: Any, config: Any) -> Any:
     for here, there in OUTSIDE.items():
         files.append(File.generated(config, there, content=(ROOT / here).read_text(encoding="utf-8")))
     return files
+
+
+def on_nav(nav: Any, **_: Any) -> Any:
+    """Add the example stores' page, which `make docs` writes into the built site."""
+    from mkdocs.structure.nav import Link
+
+    nav.items.append(Link("Example runs", "explore/index.html"))
+    return nav
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:

@@ -28,7 +28,9 @@ def test_actions_are_pinned_by_commit(workflow):
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
 def test_workflows_may_only_read_and_run_what_exists(workflow):
-    assert yaml.safe_load(workflow.read_text(encoding="utf-8"))["permissions"] == {"contents": "read"}
+    document = yaml.safe_load(workflow.read_text(encoding="utf-8"))
+    assert document["permissions"] == {"contents": "read"}
+    assert {name for name, job in document["jobs"].items() if "permissions" in job} <= {"pages"}
     targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     commands = [step["run"] for step in steps_of(workflow) if "run" in step]
     for command in commands:
