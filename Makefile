@@ -42,8 +42,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt
 SOURCES := vla_attention schemas capture analyze tests benchmarks scripts examples
 
-# The first that runs: a shim of pyenv is on PATH also where it does not.
-PYTHON312 ?= $(shell for python in python3.12 ~/.pyenv/versions/3.12*/bin/python /opt/*/bin/python3.12; do $$python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null && echo $$python && break; done)
+PYTHON312 ?= $(shell sh scripts/find_python.sh 3.12)
 
 # Processes that share the tests; WORKERS=0 runs them in one, which a debugger needs.
 WORKERS ?= 2

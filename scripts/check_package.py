@@ -1,15 +1,19 @@
 """Build the source distribution and from it the wheel, install the wheel outside the checkout, and use it there.
 
-Usage: python scripts/check_package.py [--folder FOLDER] [--newest [PYTHON ...]]
+Usage: python scripts/check_package.py [--folder FOLDER] [--release | --newest [PYTHON ...]]
 
 Two environments are made in a temporary folder, or in FOLDER, which is then kept. "laptop" is clean: the wheel and its
 dependencies. "node" is the wheel on top of the libraries of the environment that runs this script, so that a policy
-can run without a second copy of torch. A store is captured in "node" and analysed in "laptop". Exit code 1: a check
-failed.
+can run without a second copy of torch. A store is captured in "node" and analysed in "laptop". The packages are built
+from a copy of the checkout, in which the README's relative links are absolute. Exit code 1: a check failed.
 
-With --newest, instead: on each interpreter that is there (python3.11 to python3.13, or those that are named), what
-`pip install 'vla-attention[capture]'` takes today, without the versions of scripts/constraints.txt, records an episode
-and analyses it. torch may bring CUDA's libraries, several gigabytes for each interpreter.
+With --release, also: no placeholder is left and CHANGELOG.md has the date, the commit's tag fits, `twine check` finds
+nothing (it brings 25 packages, into an environment of its own), and what `pip install vla-attention` takes today shows
+the example stores on each of Python 3.11 to 3.13 that is there: 40 seconds each.
+
+With --newest, instead: on each of these interpreters, or those that are named, what `pip install
+'vla-attention[capture]'` takes today, without the versions of scripts/constraints.txt, records an episode and analyses
+it. torch may bring CUDA's libraries, several gigabytes for each interpreter.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -58,15 +63,20 @@ assert all(hasattr(va, name) for name in va.__all__), va.__all__
 print(va.__version__, va.__file__)
 """
 
-#: What `pip install` takes by itself on these is held against the wheel by --newest.
-INTERPRETERS = ("python3.11", "python3.12", "python3.13")
-#: Prints the interpreter's version, and fails where a name on the path is no interpreter (pyenv).
-PRINT_VERSION = "import platform; print(platform.python_version())"
-#: Libraries whose versions are printed.
+#: Stands for what nobody has decided yet: the author, and the address of the repository.
+PLACEHOLDER = "OWNER"
+#: A link or a picture in Markdown whose address leads nowhere outside the checkout.
+RELATIVE_LINK = re.compile(r"(!?)(\[[^\[\]]*\]\()(?![a-z]+:|#)")
+#: Pythons on which what `pip install` takes by itself is held against the wheel.
+PYTHONS = ("3.11", "3.12", "3.13")
+#: Prints the versions of Python and of those of the named libraries that are installed.
+PRINT_VERSIONS = """
+import platform, sys
+from importlib.metadata import distributions
+there = sorted((found.name, found.version) for found in distributions() if found.name in sys.argv)
+print("Python", platform.python_version(), *(word for pair in there for word in pair))
+"""
 LIBRARIES = ("zarr", "numcodecs", "numpy", "polars", "matplotlib", "torch", "mujoco")
-PRINT_LIBRARIES = (
-    "import sys; from importlib.metadata import version as v; print(*(f'{n} {v(n)}' for n in sys.argv[1:]))"
-)
 
 
 class CheckFailed(Exception):
@@ -77,7 +87,9 @@ def main() -> int:
     """Run all checks; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, help="folder for packages and environments, kept afterwards")
-    parser.add_argument(
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--release", action="store_true", help="also refuse what must not be uploaded")
+    which.add_argument(
         "--newest", nargs="*", metavar="PYTHON", help="the newest libraries instead, on these interpreters or all"
     )
     arguments = parser.parse_args()
@@ -86,12 +98,16 @@ def main() -> int:
         folder = Path(temporary) if given is None else given.resolve()
         folder.mkdir(parents=True, exist_ok=True)
         try:
+            check_release(arguments.release)
             wheel = build_packages(folder)
             if arguments.newest is None:
                 laptop, node = make_environments(wheel, folder)
                 use_packages(laptop, node, folder)
             else:
-                use_newest(wheel, arguments.newest, folder)
+                use_newest(wheel, "[capture]", arguments.newest or interpreters(), folder)
+            if arguments.release:
+                check_metadata(wheel.parent)
+                use_newest(wheel, "", interpreters(), folder)
         except CheckFailed as error:
             print(f"package check failed: {error}", file=sys.stderr)
             return 1
@@ -110,13 +126,54 @@ def version() -> str:
     return project()["version"]
 
 
+def check_release(refuse: bool) -> None:
+    """Say what is left to write before a release, or refuse it, and a commit whose tag is not that of the version."""
+    left = [
+        f"{name} line {number} ({line.split()[0]})"
+        for name in ("pyproject.toml", "docs/install.md")
+        for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), 1)
+        if PLACEHOLDER in line
+    ]
+    points = [f"the placeholder {PLACEHOLDER} stands in {', '.join(left)}"] if left else []
+    heading = f"## {version()} "
+    if not re.search(rf"^{re.escape(heading)}\(\d{{4}}-\d\d-\d\d\)$", (ROOT / "CHANGELOG.md").read_text(), re.M):
+        points.append(f"CHANGELOG.md has no heading '{heading}(YYYY-MM-DD)'")
+    check(not (refuse and points), f"not to be released: {'; '.join(points)}")
+    if points:
+        print(f"before a release (--release refuses): {'; '.join(points)}")
+    if refuse:
+        git = ("git", "-C", ROOT)
+        tags, ours = (
+            run(*git, "tag", "--list", *which, quiet=True).split()
+            for which in (("v*", "--points-at", "HEAD"), (f"v{version()}",))
+        )
+        found = f"this commit has the tags {tags}, and the checkout {ours}"
+        check(tags == ours, f"expected the tag v{version()} on this commit, or none yet; {found}.")
+        changed = run(*git, "status", "--porcelain", quiet=True)
+        check(not changed, f"a release is made from a commit, which lacks these files; commit them:\n{changed}")
+
+
+def check_metadata(packages: Path) -> None:
+    """Let twine look at what an index would be sent."""
+    environment = packages.parent / "twine"
+    run(sys.executable, "-m", "venv", "--clear", environment)
+    run(environment / "bin/python", "-m", "pip", "install", "--quiet", "twine")
+    run(environment / "bin/twine", "check", "--strict", *packages.iterdir())
+
+
 def build_packages(folder: Path) -> Path:
     """Build both packages from a copy of the checkout and check their files; returns the wheel's path."""
     source, built = folder / "source", folder / "dist"
+    outside = not folder.is_relative_to(ROOT) or folder.is_relative_to(ROOT / "build")
+    check(outside, f"{folder} is in the checkout, which is copied there; give a folder outside, or one in build/")
     for old in (source, built):
         shutil.rmtree(old, ignore_errors=True)
     shutil.copytree(ROOT, source, symlinks=True, ignore=LEFT_OUT)
-    run(sys.executable, "-m", "build", "--outdir", built, source, quiet=True)
+    write_addresses(source / "README.md")
+    output = run(sys.executable, "-m", "build", "--outdir", built, source, quiet=True)
+    # PYTHONDONTWRITEBYTECODE alone is no reason to stop.
+    warned = re.findall(r"^(?:WARNING |.*arning: )(?!.*byte-compiling is disabled).*", output, re.M)
+    check(not warned, "the build warns:\n" + "\n".join(warned))
     (sdist,), (wheel,) = built.glob("*.tar.gz"), built.glob("*.whl")
     expected = source_files(source / PACKAGE)
 
@@ -129,12 +186,23 @@ def build_packages(folder: Path) -> Path:
 
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if not name.endswith("/")}
-        (top_level,) = (archive.read(name).decode().split() for name in names if name.endswith("/top_level.txt"))
-    compare("top_level.txt of the wheel", set(top_level), {PACKAGE})
+        about = {PurePosixPath(name).name: archive.read(name).decode() for name in names if ".dist-info/" in name}
+    compare("top_level.txt of the wheel", set(about["top_level.txt"].split()), {PACKAGE})
+    relative = re.findall(r"\]\((?!https:)[^)]*\)|(?:src|href)=.(?!https:)[^>]*", about["METADATA"])
+    check(not relative, f"an index shows the README, where these lead nowhere: {relative}")
     expected = {name for name in expected if not name.startswith(SOURCES_OF_THE_PAGE)}
     compare(wheel.name, {name for name in names if ".dist-info/" not in name}, expected)
     print(f"built {sdist.name} and from it {wheel.name}: {len(expected)} files in {PACKAGE}/, nothing beside it")
     return wheel
+
+
+def write_addresses(readme: Path) -> None:
+    """Make a README's relative links absolute: to this version's tag in the repository."""
+    pages = f"{project()['urls']['Repository']}/blob/v{version()}/"
+    pictures = pages.replace("//github.com/", "//raw.githubusercontent.com/").replace("/blob/", "/")
+    text = readme.read_text(encoding="utf-8")
+    text = RELATIVE_LINK.sub(lambda link: link[0] + (pictures if link[1] else pages), text)
+    readme.write_text(text, encoding="utf-8")
 
 
 def source_files(package: Path) -> set[str]:
@@ -195,25 +263,29 @@ def capture_and_analyse(laptop: Path, node: Path, folder: Path) -> None:
     print("captured a store and analysed it with the installed wheel")
 
 
-def use_newest(wheel: Path, named: list[str], folder: Path) -> None:
-    """On each interpreter, install the wheel without constraints, record an episode and analyse it."""
-    there = {}
-    for python in named or INTERPRETERS:
-        try:
-            there[python] = run(python, "-c", PRINT_VERSION, quiet=True).strip()
-        except (CheckFailed, OSError):
-            check(not named, f"{python} runs no Python.")
-            print(f"{python} is not there")
-    check(bool(there), f"none of {', '.join(INTERPRETERS)} is there; name one: --newest PYTHON")
-    for python, number in there.items():
-        environment = folder / f"newest-{number}"
+def interpreters() -> list[str]:
+    """Return those of `PYTHONS` that run on this machine; prints which are missing."""
+    found = {python: run("sh", ROOT / "scripts/find_python.sh", python, quiet=True).strip() for python in PYTHONS}
+    missing = [python for python, path in found.items() if not path]
+    if missing:
+        print(f"not checked, since it is neither on PATH nor in ~/.pyenv or /opt: Python {', '.join(missing)}")
+    check(len(missing) < len(PYTHONS), "no Python to check with is there; name one: --newest PYTHON")
+    return [path for path in found.values() if path]
+
+
+def use_newest(wheel: Path, extra: str, pythons: list[str], folder: Path) -> None:
+    """On each interpreter, install the wheel without constraints; record an episode, or show the examples."""
+    for python in pythons:
+        check(shutil.which(python) is not None, f"{python} runs no Python.")
+        environment = folder / "newest"
         run(python, "-m", "venv", "--clear", environment)
         pip = (environment / "bin/python", "-m", "pip", "--quiet", "--disable-pip-version-check")
-        run(*pip, "install", f"{wheel}[capture]", quiet=True)
-        print(
-            f"Python {number}:", run(environment / "bin/python", "-c", PRINT_LIBRARIES, *LIBRARIES, quiet=True).strip()
-        )
-        capture_and_analyse(environment / "bin", environment / "bin", folder)
+        run(*pip, "install", f"{wheel}{extra}", quiet=True)
+        print(run(environment / "bin/python", "-c", PRINT_VERSIONS, *LIBRARIES, quiet=True).strip())
+        if extra:
+            capture_and_analyse(environment / "bin", environment / "bin", folder)
+        else:
+            use_examples(environment / "bin", folder)
         shutil.rmtree(environment)
 
 
@@ -235,9 +307,9 @@ def use_examples(laptop: Path, folder: Path) -> None:
 
 
 def run(*command: object, cwd: Path | None = None, quiet: bool = False) -> str:
-    """Run a command without the checkout on Python's path; returns its standard output.
+    """Run a command without the checkout on Python's path.
 
-    `quiet`: output is shown only when the command fails.
+    `quiet`: its output is returned, and shown only when the command fails.
 
     Raises:
         CheckFailed: it ended with another exit code than 0.
@@ -245,10 +317,9 @@ def run(*command: object, cwd: Path | None = None, quiet: bool = False) -> str:
     words = [str(word) for word in command]
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
     done = subprocess.run(words, cwd=cwd, env=environment, text=True, capture_output=quiet, check=False)
-    if done.returncode:
-        shown = f"\n{done.stdout}{done.stderr}" if quiet else ""
-        raise CheckFailed(f"exit code {done.returncode} of: {' '.join(words)}{shown}")
-    return done.stdout if quiet else ""
+    output = f"{done.stdout}{done.stderr}" if quiet else ""
+    check(not done.returncode, f"exit code {done.returncode} of: {' '.join(words)}\n{output}")
+    return output
 
 
 def check(holds: bool, message: str) -> None:
