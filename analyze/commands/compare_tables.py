@@ -59,9 +59,12 @@ def perturbed(
 
     Every task weighs the same. `pairs`: of episodes that begin alike in the first run; its suites share no states.
     """
+    runs = [(base, None), *((part.other, part.pairs) for part in parts if not part.other.run.repeats(base.run))]
+    kind = pl.col("suite").str.extract("^libero_pro_.+_(.+)$").replace_strict(_CHANGED, default=None)
+    if all(one.episodes.filter(kind.is_not_null()).is_empty() for one, _ in runs):
+        return [], []
     found = []
-    ran = [(part.other, part.pairs) for part in parts if not part.other.run.repeats(base.run)]
-    for one, pairs in ((base, None), *ran):
+    for one, pairs in runs:
         rows, means = one.episodes.select(EPISODE_ID), pl.mean("solved", "did", "named")
         no_objects = one.episodes.select(*EPISODE_ID, kind=None, item=None, value=pl.lit(None, pl.Float64))
         named = one.values.get("objects", no_objects).filter(kind="class", item=CLASSES[0])
@@ -76,11 +79,7 @@ def perturbed(
         num_pairs = [None if pairs is None else pairs.filter(suite=suite).height for suite in suites["suite"]]
         run, of_pairs = pl.lit(one.run.name).alias("run"), pl.Series("pairs", num_pairs, pl.Int64)
         found.append(suites.select(run, pl.all()).with_columns(of_pairs))
-    kind = pl.col("suite").str.extract("^libero_pro_.+_(.+)$").replace_strict(_CHANGED, default=None)
-    table = pl.concat(found).with_columns(named=2.0 ** pl.col("named"), kind=kind)
-    if table["kind"].null_count() == table.height:
-        return [], []
-    table = table.with_columns(pl.col("kind").fill_null("nothing"))
+    table = pl.concat(found).with_columns(named=2.0 ** pl.col("named"), kind=kind.fill_null("nothing"))
     said = [
         f"{row['kind']} ({row['run']}): {plural(row['num_episodes'], 'episode')}, "
         + ", ".join(how.format(row[name]) for name, how in _SAID.items() if row[name] is not None)

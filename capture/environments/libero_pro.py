@@ -130,9 +130,10 @@ def pro_initial_states(task: Task) -> NDArray[np.float64]:
 
 def check_pro_assets(suite: str, assets: Path) -> Path:
     """Return the assets; `LiberoAssetsMissing` where they lack objects of LIBERO-PRO, in a suite that has them."""
+    if own_name(suite) is None or not suite.endswith("_object"):
+        return assets
     there = {path.stem for path in assets.glob("*/*")}
-    absent = [name for name in _OBJECTS if name not in there]
-    if absent and own_name(suite) and suite.endswith("_object"):
+    if absent := [name for name in _OBJECTS if name not in there]:
         raise LiberoAssetsMissing(
             f"The assets in '{assets}' lack {listing(absent, 3)}, objects of LIBERO-PRO in {suite}. The wheels have "
             f"them: {INSTALL_LIBERO_ASSETS}; then leave out --libero-assets."
