@@ -24,7 +24,14 @@ from vla_attention.capture.interventions.resolution import (
     site_tokens,
 )
 from vla_attention.capture.interventions.run_changes import RunChanges, named_objects
-from vla_attention.capture.policies.policy import CallVariant, Policy, PolicyInput, UnitsPolicy, VariantPolicy
+from vla_attention.capture.policies.policy import (
+    CallVariant,
+    Policy,
+    PolicyInput,
+    UnitsPolicy,
+    VariantPolicy,
+    changed_actions,
+)
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import EffectsRecorded
@@ -126,7 +133,7 @@ class EffectMeasurement:
     def _single(self, variant: CallVariant) -> NDArray[np.float64] | None:
         """Return the actions of a variant by a call of its own; None where it leaves a query without any key."""
         try:
-            return self.policy.act(variant.policy_input, variant.noise_seed, None, variant.editors or None)
+            return changed_actions(self.policy, variant.policy_input, variant.noise_seed, None, variant.editors or None)
         except QueryWithoutKeys as error:
             self.say_once(f"Left out of the effects: {error}")
             return None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.policies.policy import BatchPolicy, GivenInputs, Policy, PolicyInput
+from vla_attention.capture.policies.policy import BatchPolicy, GivenInputs, Policy, PolicyInput, changed_actions
 from vla_attention.capture.recording.attention import AttentionEditor
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin, not_finite
 from vla_attention.capture.recording.recorder import AttentionRecorder, make_recorders
@@ -108,7 +108,8 @@ class Caller:
         made = []
         for call, of_call in zip(calls, editors, strict=True):
             own = self._recorders(call)
-            made.append(self._made(call, policy.act(call.policy_input, call.noise_seed, own, of_call), own, of_call))
+            one = changed_actions(policy, call.policy_input, call.noise_seed, own, of_call)
+            made.append(self._made(call, one, own, of_call))
         return made
 
     def _recorders(self, call: PolicyCall) -> dict[str, AttentionRecorder]:

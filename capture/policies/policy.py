@@ -144,6 +144,20 @@ class Policy(ModelSizes, Protocol):
         """
 
 
+def changed_actions(
+    policy: Policy,
+    policy_input: PolicyInput,
+    noise_seed: int,
+    recorders: Mapping[str, RowCollector] | None,
+    editors: Mapping[str, AttentionEditor] | None,
+) -> NDArray[np.float64]:
+    """Return what `act` gives; raise `QueryWithoutKeys` where the editors left a query without any key."""
+    actions = policy.act(policy_input, noise_seed, recorders, editors)
+    for editor in (editors or {}).values():
+        editor.finish()
+    return actions
+
+
 @runtime_checkable
 class BatchPolicy(Protocol):
     """A policy that can make several calls at a time."""

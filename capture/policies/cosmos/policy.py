@@ -173,8 +173,6 @@ class CosmosPolicy:
         given, text = policy_input.tensors["given"], policy_input.tensors["text"]
         queries = config.frames.index(self.query_frame)
         clean = self.model.sample_latents(given, text, noise_seed, queries, recorders, editors)[0].cpu()
-        for editor in (editors or {}).values():
-            editor.finish()
         frame = clean[:, config.frames.index(ACTION_FRAME)]
         actions = actions_of_frame(frame, config.chunk_size, config.action_dim).numpy()
         return self.statistics.environment_actions(actions)

@@ -221,8 +221,6 @@ class PiPolicy:
         sampled = self._sample(
             policy_input.tensors, [noise_seed], (recorders or {}).get(site), (editors or {}).get(site)
         )
-        for editor in (editors or {}).values():
-            editor.finish()
         return self.processing.environment_actions(sampled[0], policy_input.state)
 
     def act_batch(

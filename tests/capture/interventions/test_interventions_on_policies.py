@@ -23,6 +23,7 @@ from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_rando
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.processing import openpi_processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.policies.policy import changed_actions
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import AttentionScale, AttentionUniform, Interventions, KeyKnockout
@@ -219,7 +220,7 @@ def test_a_query_is_left_without_keys(policy):
     first = 1 if policy.family == "pi0" else 0  # pi0's first query is the state's
     everything = f"keys:0-{policy.sites[-1].num_keys - 1}" if len(policy.sites) == 1 else "span:text"
     with pytest.raises(QueryWithoutKeys, match=rf"site '{site}', layer 0, denoise step 0, head 0, query {first}"):
-        policy.act(given, 0, None, editors_of(policy, given, KeyKnockout(everything)))
+        changed_actions(policy, given, 0, None, editors_of(policy, given, KeyKnockout(everything)))
 
 
 def test_chosen_places(policy):

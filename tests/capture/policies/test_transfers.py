@@ -19,7 +19,7 @@ from vla_attention.capture.interventions.resolution import interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_policy
 from vla_attention.capture.policies.pi.embedded import dummy_policy
-from vla_attention.capture.policies.policy import CallVariant
+from vla_attention.capture.policies.policy import CallVariant, changed_actions
 from vla_attention.capture.recording import recorder
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 
@@ -66,7 +66,7 @@ def editors_of(policy, given, change):
 def test_a_recorded_call_reads_back_once(on_meta, change):
     policy, given, moved = on_meta
     recorders = recorders_of(policy, given)
-    policy.act(given, 5, recorders, editors_of(policy, given, change))
+    changed_actions(policy, given, 5, recorders, editors_of(policy, given, change))
     first = len(moved)
     assert first == 1 + (change is not CHANGES["unchanged"])  # actions, and whether queries kept keys
     for one in recorders.values():
