@@ -112,8 +112,10 @@ def find_libero_assets(folder: Path) -> Finding:
     if not (lacking or differing):
         return "ok", f"LIBERO's originals ({number} files) in {folder}."
     named = [(differing, "differ"), (lacking, "are missing")]
-    others = " and ".join(f"{len(names)} {how} ({listing(names, 3)})" for names, how in named if names)
-    return "note", f"{folder}: of LIBERO's {number} files {others}. Pictures may differ from the published ones."
+    others = " and ".join(f"{len(names)} {how}" for names, how in named if names)
+    files = [path.rpartition("/")[2] for path in (*differing, *lacking)]
+    which = f" ({listing(files)})" if len(files) <= 3 else ""
+    return "note", f"{folder}: of LIBERO's {number} files {others}{which}. Pictures may differ from the published ones."
 
 
 def _version(package: str) -> str:
