@@ -107,8 +107,9 @@ def gr00t(width: int, blocks: int) -> Case:
 
 def pi0_fast(width: int, blocks: int) -> Case:
     from tests.policies import lerobot_models as models
+    from tests.policies.lerobot_pi_models import small_pi0_fast
 
-    policy = models.small_pi0_fast(
+    policy = small_pi0_fast(
         {"width": width, "depth": blocks, "mlp_dim": 4 * width, "num_heads": 8, "head_dim": width // 8},
         112,
         **{"n_action_steps": 10, "chunk_size": 10, "max_decoding_steps": 20},

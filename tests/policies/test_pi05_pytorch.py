@@ -11,7 +11,7 @@ import torch
 pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerobot")
 
 import vla_attention as va
-from tests.policies import lerobot_models as models
+from tests.policies.lerobot_pi_models import small_pi05_lerobot
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig
 from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
 from vla_attention.capture.recording.recorder import make_recorders
@@ -55,7 +55,7 @@ def given() -> Mapping[str, torch.Tensor]:
 
 
 def test_contributions_are_those_of_our_own_network(model, given, tmp_path):
-    policy = models.small_pi05_lerobot(CONFIG, model.state_dict())
+    policy = small_pi05_lerobot(CONFIG, model.state_dict())
     layout = va.layouts.pi0_pytorch(policy, cameras=CONFIG.cameras)
     site = layout.site("joint").keys
     roles = dict.fromkeys(CONFIG.cameras, Role.IMAGE) | {"prompt": Role.INSTRUCTION, "actions": Role.ACTION}

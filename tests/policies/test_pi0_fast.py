@@ -14,6 +14,7 @@ pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerob
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_pi_models import small_pi0_fast
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -37,7 +38,7 @@ PREFIX = 2 * PATCHES + WORDS + PADDING + 1
 
 
 def case_of(**changes) -> PolicyCase:
-    policy = models.small_pi0_fast(**changes)
+    policy = small_pi0_fast(**changes)
     given = models.observation(56, 56, padding=PADDING)
     layout = va.layouts.pi0_fast(policy)
     return PolicyCase(

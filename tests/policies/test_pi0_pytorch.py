@@ -17,6 +17,7 @@ pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerob
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_pi_models import small_pi0_lerobot
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -39,7 +40,7 @@ WORDS = len(INSTRUCTION.split())
 
 @pytest.fixture(scope="module")
 def case():
-    policy = models.small_pi0_lerobot()
+    policy = small_pi0_lerobot()
     given = models.observation(56, 56, padding=PADDING)
     frames, state = models.frames_of(given), given["observation.state"]
     return PolicyCase(policy, va.layouts.pi0_pytorch(policy), models.chunk_of(policy), given, frames, state)
