@@ -8,7 +8,19 @@ from vla_attention.capture.policies.families import policy_families
 from vla_attention.schemas.errors import BadArgument
 
 #: Policies that are called from their user's own code.
-_OWN_CODE = ("smolvla", "openvla", "openvla-oft", "act", "xvla", "x-vla", "gr00t", "groot", "diffusion", "tinyvla")
+_OWN_CODE = (
+    "smolvla",
+    "openvla",
+    "openvla-oft",
+    "act",
+    "xvla",
+    "x-vla",
+    "gr00t",
+    "groot",
+    "evo1",
+    "diffusion",
+    "tinyvla",
+)
 
 
 def refuse_other_tools_words(words: Sequence[str]) -> None:

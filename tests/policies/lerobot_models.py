@@ -18,7 +18,7 @@ from lerobot.utils.constants import (
     OBS_STATE,
 )
 
-from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
+from tests.policies.word_tokenizer import INSTRUCTION, WORDS, WordTokenizer
 
 IS_04 = version("lerobot").startswith("0.4.")
 CAMERAS = ("top", "wrist")
@@ -310,3 +310,40 @@ def groot_observation(patches: int = 4) -> dict[str, torch.Tensor]:
         "state": torch.randn(1, 1, STATE_DIM, generator=generator),
         "embodiment_id": torch.zeros(1, dtype=torch.long),
     }
+
+
+def small_evo1(folder: Path, **changes: Any) -> Any:
+    """LeRobot 0.6's Evo1Policy of three blocks; a small InternVL 3 and Qwen 2's tokenizer are written into `folder`."""
+    from lerobot.policies.evo1.configuration_evo1 import Evo1Config
+    from lerobot.policies.evo1.modeling_evo1 import Evo1Policy
+    from transformers import InternVLConfig, InternVLModel, Qwen2Tokenizer
+
+    # Words are tokens, those of other sentences too.
+    tokenizer = Qwen2Tokenizer().train_new_from_iterator([" ".join(("", *WORDS)), "\nput", "Image-1: "] * 2, 400)
+    tokenizer.add_special_tokens({"additional_special_tokens": ["<img>", "<IMG_CONTEXT>", "</img>"]})
+    tokenizer.save_pretrained(folder)
+    text = {
+        **{"model_type": "qwen2", "hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 3},
+        **{"num_attention_heads": 2, "num_key_value_heads": 1, "vocab_size": len(tokenizer)},
+    }
+    vision = {
+        **{"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2},
+        **{"image_size": 16, "patch_size": 4},
+    }
+    placeholder = tokenizer.convert_tokens_to_ids("<IMG_CONTEXT>")
+    torch.manual_seed(0)
+    vlm = InternVLConfig(text_config=text, vision_config=vision, image_seq_length=4, image_token_id=placeholder)
+    InternVLModel(vlm).save_pretrained(folder)
+    settings: dict[str, Any] = {
+        **features(24, 24),
+        **{"vlm_model_name": str(folder), "vlm_num_layers": 2, "vlm_dtype": "float32", "image_resolution": (16, 16)},
+        **{"max_text_length": 64, "embed_dim": 16, "hidden_dim": 24, "state_hidden_dim": 16, "num_heads": 2},
+        **{
+            "num_layers": 3,
+            "num_inference_timesteps": 3,
+            "chunk_size": 5,
+            "n_action_steps": 5,
+            "use_flash_attn": False,
+        },
+    }
+    return Evo1Policy(Evo1Config(**{**settings, **changes})).eval()

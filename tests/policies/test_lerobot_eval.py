@@ -18,6 +18,7 @@ pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerob
 
 import gymnasium
 
+import vla_attention as va
 from tests.policies import lerobot_models as models
 from tests.policies.noise_environment import ENDS, NoiseEnvironment
 from tests.policies.word_tokenizer import INSTRUCTION, WordTokenizer
@@ -51,11 +52,16 @@ def lerobot_eval():
     module.rollout, module.run_one = own
 
 
-def test_two_environments_are_two_episodes_that_end_when_they_end(lerobot_eval, tmp_path):
+@pytest.mark.parametrize("name", ["smolvla", "evo1"])
+def test_two_environments_are_two_episodes_that_end_when_they_end(lerobot_eval, tmp_path, name):
     from lerobot_policy_vla_attention.recorder import Recorder
 
-    policy = models.small_smolvla(tmp_path / "vlm")
-    recorder = Recorder(str(tmp_path / "run.zarr"), tokenizer=WordTokenizer(), untrained=True, durable=False)
+    if name == "evo1":
+        pytest.importorskip("lerobot.policies.evo1", reason="LeRobot 0.6's, in .venv-lerobot06")
+        policy, tokenizer = models.small_evo1(tmp_path / "vlm", max_action_dim=models.ACTION_DIM), {}
+    else:
+        policy, tokenizer = models.small_smolvla(tmp_path / "vlm"), {"tokenizer": WordTokenizer()}
+    recorder = Recorder(str(tmp_path / "run.zarr"), **tokenizer, untrained=True, durable=False)
 
     def evaluate() -> Any:
         policy.reset()
@@ -86,8 +92,9 @@ def test_two_environments_are_two_episodes_that_end_when_they_end(lerobot_eval, 
     assert [part.attributes.instruction for part in store.episodes] == [INSTRUCTION] * 2
     first = NoiseEnvironment(1)._observation()["pixels"]["wrist"]
     frame = store.episodes[1].read("frames/wrist")[0]
-    # SmolVLA pads a picture of 48 x 64 at the top.
-    np.testing.assert_array_equal(frame[16:], first)
+    if name == "smolvla":  # pads a picture of 48 x 64 at the top
+        np.testing.assert_array_equal(frame[16:], first)
+    assert "bowl" in va.open(tmp_path / "run.zarr").words()["words"]["item"].to_list()
 
 
 @pytest.fixture

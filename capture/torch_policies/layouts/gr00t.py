@@ -8,13 +8,16 @@ pictures only (`cross_image`), so that a ratio of both inside one block is undef
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from operator import attrgetter
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, NotThisPolicy, square
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    FoundModule,
+    KeyOrder,
+    NotThisPolicy,
+    prompt_with_pictures,
+)
 from vla_attention.capture.torch_policies.policy_layout import CameraPicture, PolicyLayout, PromptText
-from vla_attention.schemas.errors import BadArgument
 
 _NAME = "gr00t"
 
@@ -49,7 +52,7 @@ def gr00t(
     head = found.module.action_head
     placeholder = _placeholder(found.module.backbone) if image_token is None else image_token
     ids = [int(token) for token in input_ids]
-    keys, texts = _encoder_keys(ids, placeholder, cameras, picture_size, prompt_tokens)
+    keys, texts = prompt_with_pictures(ids, placeholder, cameras, picture_size, prompt_tokens, _NAME)
     blocks = len(head.model.transformer_blocks)
     interleaved = bool(head.model.config.interleave_self_attention)
     self_blocks = tuple(range(1, blocks, 2)) if interleaved else ()
@@ -117,25 +120,3 @@ def _embedding(found: FoundModule) -> str:
     raise NotThisPolicy(
         f"The model's text embedding is at none of the places of GR00T N1.5 and N1.7: {', '.join(names)}."
     )
-
-
-def _encoder_keys(
-    ids: list[int], placeholder: int, cameras: Sequence[str], size: int, longest: int
-) -> tuple[KeyOrder, list[str]]:
-    """The keys of the vision-language model's tokens, and the names of its text spans in order."""
-    runs = [(picture, len(list(run))) for picture, run in groupby(ids, lambda token: token == placeholder)]
-    if sum(picture for picture, _ in runs) != len(cameras) or not runs or runs[-1][0]:
-        raise BadArgument(
-            f"The ids of one call hold {sum(picture for picture, _ in runs)} runs of placeholders for patches (id "
-            f"{placeholder}), and the text must end them; expected one for each of the cameras {list(cameras)}."
-        )
-    keys, texts, names = KeyOrder(), [], iter(cameras)
-    for number, (picture, count) in enumerate(runs):
-        if picture:
-            side = square(count, "pictures", _NAME)
-            keys.add_picture(next(names), side, side, size, size)
-            continue
-        last = number == len(runs) - 1
-        texts.append("prompt" if last else f"template_{number}")
-        keys.add(texts[-1], "text", (longest or 2 * count) if last else count, "instruction" if last else "template")
-    return keys, texts

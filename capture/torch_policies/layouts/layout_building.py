@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any, cast
 
 from vla_attention.capture.torch_policies.policy_layout import (
@@ -130,3 +131,35 @@ class KeyOrder:
             cameras=tuple(CameraPicture(camera, fit) for camera in cameras),
             **{"family": name, **others},
         )
+
+
+def prompt_with_pictures(
+    ids: Sequence[int], placeholder: int, cameras: Sequence[str], size: int, longest: int, layout: str
+) -> tuple[KeyOrder, list[str]]:
+    """Return the keys of a vision-language model's tokens, and the names of its text spans in order.
+
+    Args:
+        ids: of one call without padding; placeholder: the id that stands for a patch.
+        cameras: names of the square pictures in order; size: their sides in pixels.
+        longest: number of tokens of the longest text after the last picture; 0: twice that of `ids`.
+
+    Raises:
+        BadArgument: the ids do not hold one picture for each camera.
+        NotThisPolicy: a picture is no square of patches.
+    """
+    runs = [(picture, len(list(run))) for picture, run in groupby(ids, lambda token: token == placeholder)]
+    if sum(picture for picture, _ in runs) != len(cameras) or not runs or runs[-1][0]:
+        raise BadArgument(
+            f"The ids of one call hold {sum(picture for picture, _ in runs)} runs of placeholders for patches (id "
+            f"{placeholder}), and the text must end them; expected one for each of the cameras {list(cameras)}."
+        )
+    keys, texts, names = KeyOrder(), [], iter(cameras)
+    for number, (picture, count) in enumerate(runs):
+        if picture:
+            side = square(count, "pictures", layout)
+            keys.add_picture(next(names), side, side, size, size)
+            continue
+        last = number == len(runs) - 1
+        texts.append("prompt" if last else f"template_{number}")
+        keys.add(texts[-1], "text", (longest or 2 * count) if last else count, "instruction" if last else "template")
+    return keys, texts

@@ -20,6 +20,7 @@ PREFIX = "observation.images."
 #: LeRobot's name of a policy -> its layout.
 LAYOUTS = {
     "act": va.layouts.act,
+    "evo1": va.layouts.evo1,
     "pi0": va.layouts.pi0_pytorch,
     "pi05": va.layouts.pi0_pytorch,
     "pi0_fast": va.layouts.pi0_fast,
@@ -38,10 +39,11 @@ def layout_of(policy: Any) -> va.PolicyLayout:
     return LAYOUTS[policy.name](policy)
 
 
-def tokenizer_of(preprocessor: Any) -> Any:
-    """Return the tokenizer of the policy's preprocessor, or None."""
-    steps = getattr(preprocessor, "steps", ())
-    return next((step.input_tokenizer for step in steps if getattr(step, "input_tokenizer", None) is not None), None)
+def tokenizer_of(preprocessor: Any, policy: Any) -> Any:
+    """Return the tokenizer of the policy's preprocessor or of one of its modules (EVO-1), or None."""
+    found = [getattr(step, "input_tokenizer", None) for step in getattr(preprocessor, "steps", ())]
+    found += [getattr(module, "tokenizer", None) for module in policy.modules()]
+    return next((tokenizer for tokenizer in found if tokenizer is not None), None)
 
 
 def pictures_of(observation: dict[str, Any], preprocessor: Any, row: int) -> dict[str, Any]:
@@ -93,7 +95,7 @@ class Recorder:
         """Run a batch of environments once, and store an episode of each."""
         preprocessor, observed = arguments.pop("preprocessor"), {}
         if self.run is None:
-            tokenizer = tokenizer_of(preprocessor)
+            tokenizer = tokenizer_of(preprocessor, policy)
             settings = {"layout": layout_of(policy), "tokenizer": tokenizer, **self.settings}
             self.run = va.record(self.store, policy, **settings).__enter__()
         first, self.episodes = self.episodes, self.episodes + env.num_envs
