@@ -347,3 +347,25 @@ def small_evo1(folder: Path, **changes: Any) -> Any:
         },
     }
     return Evo1Policy(Evo1Config(**{**settings, **changes})).eval()
+
+
+def small_multi_task_dit(folder: Path, **changes: Any) -> Any:
+    """LeRobot 0.6's MultiTaskDiTPolicy of three blocks; small CLIP encoders are written into `folder`."""
+    from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
+    from lerobot.policies.multi_task_dit.modeling_multi_task_dit import MultiTaskDiTPolicy
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPVisionConfig, CLIPVisionModel
+
+    sizes = {"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, "num_attention_heads": 2}
+    torch.manual_seed(0)
+    CLIPTextModel(CLIPTextConfig(**sizes, vocab_size=100, eos_token_id=99)).save_pretrained(folder / "clip_text")
+    CLIPVisionModel(CLIPVisionConfig(**sizes, image_size=16, patch_size=8)).save_pretrained(folder / "clip_vision")
+    settings: dict[str, Any] = {
+        **features(24, 24),
+        **{"text_encoder_name": str(folder / "clip_text"), "vision_encoder_name": str(folder / "clip_vision")},
+        **{"image_crop_shape": (16, 16), "horizon": 8, "n_action_steps": 4, "hidden_dim": 16, "num_layers": 3},
+        **{"num_heads": 2, "timestep_embed_dim": 8, "num_inference_steps": 3, "num_integration_steps": 3},
+    }
+    policy = MultiTaskDiTPolicy(MultiTaskDiTConfig(**{**settings, **changes})).eval()
+    for block in policy.noise_predictor.transformer_blocks:  # zero in a policy that was not trained
+        torch.nn.init.normal_(block.adaLN_modulation[-1].weight, std=0.2)
+    return policy

@@ -7,12 +7,13 @@ argument. docs/my-policy.md says with which versions each was tried, and what wa
 from vla_attention.capture.torch_policies.layouts.act import act
 from vla_attention.capture.torch_policies.layouts.evo1 import evo1
 from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
+from vla_attention.capture.torch_policies.layouts.multi_task_dit import multi_task_dit
 from vla_attention.capture.torch_policies.layouts.openvla import openvla, openvla_oft
 from vla_attention.capture.torch_policies.layouts.pi0 import pi0_fast, pi0_pytorch, pi0_transformers
 from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 
 __all__ = [
-    "act", "evo1", "gr00t", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch", "pi0_transformers",
+    "act", "evo1", "gr00t", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch", "pi0_transformers",
     "smolvla", "xvla",
 ]  # fmt: skip
