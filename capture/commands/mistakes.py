@@ -9,18 +9,8 @@ from vla_attention.schemas.errors import BadArgument
 
 #: Policies that are called from their user's own code.
 _OWN_CODE = (
-    "smolvla",
-    "openvla",
-    "openvla-oft",
-    "act",
-    "xvla",
-    "x-vla",
-    "gr00t",
-    "groot",
-    "evo1",
-    "diffusion",
-    "tinyvla",
-)
+    "smolvla", "openvla", "openvla-oft", "act", "xvla", "x-vla", "gr00t", "groot", "evo1", "diffusion", "tinyvla",
+)  # fmt: skip
 
 
 def refuse_other_tools_words(words: Sequence[str]) -> None:
