@@ -10,6 +10,7 @@
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
 #   make test-numpy1 recorder, stores and analysis with numpy 1.26, in an environment of its own (.venv-numpy1)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
+#   make test-rerun  Rerun recordings, with three releases of rerun-sdk, in an environment of its own (.venv-rerun)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
 #   make notebooks   runs the notebooks of examples/ and stores what they show, in an environment of its own (.venv-notebooks)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
@@ -49,7 +50,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: libero-assets capture analyze test test-policies test-remote test-policies-lerobot06 test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: libero-assets capture analyze test test-policies test-remote test-rerun test-policies-lerobot06 test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -104,6 +105,10 @@ test-policies-lerobot06: .venv-lerobot06/installed
 # moto brings fifty packages, and nothing else needs them.
 test-remote: .venv-remote/installed
 	.venv-remote/bin/pytest --thorough tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
+
+# The oldest release, the one that LeRobot 0.6 takes, and the newest that was tried; half a gigabyte each, one at a time.
+test-rerun: .venv-rerun/installed
+	for release in 0.24.1 0.33.1 0.41.0; do .venv-rerun/bin/python -m pip install --quiet --disable-pip-version-check rerun-sdk==$$release && .venv-rerun/bin/pytest tests/analyze/view/test_rrd_file.py $(ARGS) || exit 1; done
 
 # Written in place: texts, tables and small pictures, without times, counters and paths of this machine.
 notebooks: .venv-notebooks/installed
@@ -211,6 +216,12 @@ setup-analyze: .venv/analyze-installed
 	.venv-remote/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e '.[remote]' 'moto[server]>=5' pytest hypothesis
 	@touch $@
 
+.venv-rerun/installed: pyproject.toml scripts/constraints.txt
+	@echo "Installing the analysis environment and pytest into .venv-rerun ..."
+	$(PYTHON) -m venv .venv-rerun
+	.venv-rerun/bin/python -m pip install --quiet --disable-pip-version-check -c scripts/constraints.txt -e . pytest hypothesis
+	@touch $@
+
 .venv-docs/installed: docs/requirements.txt
 	@echo "Installing mkdocs into .venv-docs ..."
 	$(PYTHON) -m venv .venv-docs
@@ -230,4 +241,4 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-lerobot06 .venv-remote .venv-audit .venv-notebooks .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-lerobot06 .venv-remote .venv-rerun .venv-audit .venv-notebooks .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

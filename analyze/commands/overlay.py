@@ -17,6 +17,7 @@ from vla_attention.analyze.core.camera_maps import (
     camera_names,
     choose_episodes,
     episode_maps,
+    line_levels,
     orientation_notes,
     patch_table,
     scale_end,
@@ -37,8 +38,6 @@ from vla_attention.schemas.safe_text import file_part, visible
 _TINY = float(np.finfo(float).tiny)
 #: A group's patches are those of which it takes at least this share.
 _OUTLINE_WEIGHT = 0.5
-#: Lines are drawn around what gets so many times even attention; the second is the highest that fits the scale.
-_FIRST_LEVEL, _SECOND_LEVELS = 2.0, (50.0, 20.0, 10.0, 5.0)
 _PLACES = (("top", "middle", "bottom"), ("left", "centre", "right"))
 _COLUMNS = (
     Column("task_id", "count", "task"),
@@ -89,7 +88,7 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
     high = scale_end(
         np.concatenate([one.lift[list(which)].ravel() for maps, which in drawn for one in maps.cameras.values()])
     )
-    levels = [_FIRST_LEVEL, *[level for level in _SECOND_LEVELS if level <= 0.8 * high][:1]]
+    levels = line_levels(high)
     of_words = np.array([lift for maps in every for line in maps.words for _, lift in line])
     options = {"high": high, "levels": levels, "smooth": smooth, "outlines": list(groups.names) if groups else [],
                "words_high": scale_end(of_words)}  # fmt: skip

@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 _TOP_QUANTILE = 0.995
 #: It ends at this many times the value of uniform attention, or above.
 _LEAST_TOP = 4.0
+#: Lines are drawn around what gets so many times even attention; the second is the highest that fits the scale.
+_FIRST_LEVEL, _SECOND_LEVELS = 2.0, (50.0, 20.0, 10.0, 5.0)
 #: Cells along a side of a map that adds several grids.
 _MOST_CELLS = 128
 #: Grey that stands for a picture that was not stored.
@@ -282,6 +284,11 @@ def scale_end(values: NDArray[np.floating]) -> float:
     high = max(float(np.quantile(finite, _TOP_QUANTILE)) if finite.size else 0.0, _LEAST_TOP)
     step = 10.0 ** (np.floor(np.log10(high)) - 1)
     return float(np.round(np.ceil(np.round(high / step, 9)) * step, 12))
+
+
+def line_levels(high: float) -> list[float]:
+    """The lifts around which lines are drawn in pictures whose scale ends at `high`; at most two."""
+    return [_FIRST_LEVEL, *[level for level in _SECOND_LEVELS if level <= 0.8 * high][:1]]
 
 
 def patch_table(maps: EpisodeMaps, replans: Sequence[int]) -> pl.DataFrame:

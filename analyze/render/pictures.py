@@ -133,7 +133,7 @@ def pictures(figure: Figure, style: Style) -> Canvas:
         regions += [np.array(member, dtype=bool) for member in one.get("members") or ()]
         for number, region in enumerate(regions):
             if region is not None:
-                around[number] += _around(region, 0.12 * (number >= len(levels)), (x, y), (side, down))
+                around[number] += borders(region, 0.12 * (number >= len(levels)), (x, y), (side, down))
     for segments, (color, points, _) in zip(around, looks, strict=True):
         _draw_lines(axes, segments, color, points)
     if has_map:
@@ -150,10 +150,13 @@ def _lit(one: Mapping[str, Any], o: Mapping[str, Any]) -> tuple[NDArray[np.uint8
     return lit(picture, values, o["high"], bool(o.get("smooth"))), values
 
 
-def _around(
+def borders(
     member: NDArray[np.bool_], inside: float, start: tuple[float, float], sides: tuple[float, float]
 ) -> list[Segment]:
-    """The borders of the member patches (row, column), `inside` of a patch within them."""
+    """The borders of the member patches (row, column), `inside` of a patch within them.
+
+    start, sides: the picture's corner, and its width and height.
+    """
     patch = np.array([sides[0] / member.shape[1], sides[1] / member.shape[0]] * 2)
     wide = np.pad(member, 1)
     segments = []

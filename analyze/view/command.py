@@ -1,4 +1,4 @@
-"""`vla-analyze view`: a local page on which the attention of a store is explored, or the same page as a static site."""
+"""`vla-attention view`: a local page on which a store is explored, the same page as files, or Rerun recordings."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from vla_attention.analyze.view.served_stores import ServedStore
-    from vla_attention.schemas.stores.reader import Store
+    from vla_attention.schemas.stores.reader import Store, StoredEpisode
     from vla_attention.schemas.stores.store_url import StorePlace
 
 _EXAMPLES = """examples:
   vla-attention view runs/cubes.zarr
   vla-attention view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
   vla-attention view runs/cubes.zarr --file episode.html --task 3 --episode 1       one episode, to send
+  vla-attention view runs/cubes.zarr --rrd episode.rrd --task 3         one episode for Rerun's viewer
   vla-attention view hf://datasets/ORG/NAME/libero_10.zarr
   vla-attention view runs/cubes.zarr --port 8765 --no-open           on another machine, with ssh -L 8765:127.0.0.1:8765
   vla-attention view runs/cubes.zarr --port 8765 --allow-host hub.example.org      behind a proxy, as JupyterHub
@@ -56,8 +57,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--file", type=Path, metavar="PAGE.html", help="write one episode as a page in one file that opens from disk"
     )
-    parser.add_argument("--task", type=int, metavar="N", help="of --file: the episode's task (default: the first)")
-    parser.add_argument("--episode", type=int, metavar="N", help="of --file: its number (default: the first)")
+    rrd = "write one episode as a Rerun recording, or every one into a folder (needs the extra [rerun])"
+    parser.add_argument("--rrd", type=Path, metavar="NAME.rrd|FOLDER", help=rrd)
+    task = "of --file and --rrd: the episode's task (default: the first; of a folder: all)"
+    parser.add_argument("--task", type=int, metavar="N", help=task)
+    number = "of --file and --rrd: its number (default: the first; of a folder: all)"
+    parser.add_argument("--episode", type=int, metavar="N", help=number)
     parser.add_argument("--heads", action="store_true", help="of --site and --file: with the rows of every head")
     return parser
 
@@ -75,8 +80,14 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.site is not None:
         check_site(arguments.site)
     places: list[StorePlace] = list(dict.fromkeys(arguments.stores))
-    if arguments.file is not None and (len(places) > 1 or arguments.site is not None):
-        raise BadArgument("--file writes one episode of one store, and nothing else; leave out the other ones.")
+    written = [name for name in ("--file", "--rrd", "--site") if getattr(arguments, name.strip("-")) is not None]
+    if len(written) > 1:
+        raise BadArgument(f"{' and '.join(written)} are two things to write; give one of them.")
+    if len(places) > 1 and written not in ([], ["--site"]):
+        raise BadArgument(f"{written[0]} writes episodes of one store, and {len(places)} are given; give one.")
+    if arguments.rrd is not None:
+        _write_recordings(arguments, open_store(places[0]))
+        return 0
     with ExitStack() as stack:
         stores = [ServedStore(open_store(place), stack.enter_context(closing(Summary()))) for place in places]
         for store in stores:
@@ -90,11 +101,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
     import warnings
-    from dataclasses import replace
 
     from vla_attention.analyze.view.static_site import site_size, write_page_file, write_site
     from vla_attention.schemas.command_line import format_bytes
-    from vla_attention.schemas.errors import BadArgument, Note, listing
+    from vla_attention.schemas.errors import Note
 
     if arguments.site is not None:
         about = format_bytes(site_size(stores, arguments.heads))
@@ -105,14 +115,30 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     if arguments.site is not None:
         print(write_site(arguments.site, stores, arguments.heads))
         return
-    first, wanted = stores[0], (arguments.task, arguments.episode)
-    episodes = {one.name: one for one in first.store.episodes}
-    for name, episode in episodes.items():
-        if all(given in (None, own) for given, own in zip(wanted, parse_episode_name(name), strict=True)):
-            only = replace(first, store=replace(first.store, episodes=(episode,)))
-            print(write_page_file(arguments.file, only, arguments.heads))
-            return
-    raise BadArgument(f"{first.store.path} has no such episode (--task, --episode); it has {listing(episodes, 20)}.")
+    print(write_page_file(arguments.file, stores[0], _wanted(arguments, stores[0].store)[0], arguments.heads))
+
+
+def _write_recordings(arguments: argparse.Namespace, store: Store) -> None:
+    from vla_attention.analyze.view.rrd_file import SUFFIX, write_recordings
+
+    episodes = _wanted(arguments, store)
+    print(write_recordings(arguments.rrd, store, episodes[:1] if arguments.rrd.suffix == SUFFIX else episodes))
+
+
+def _wanted(arguments: argparse.Namespace, store: Store) -> list[StoredEpisode]:
+    """The episodes that --task and --episode name."""
+    from vla_attention.schemas.errors import BadArgument, listing
+
+    given = arguments.task, arguments.episode
+    episodes = [
+        one
+        for one in store.episodes
+        if all(number in (None, own) for number, own in zip(given, parse_episode_name(one.name), strict=True))
+    ]
+    if not episodes:
+        names = listing([one.name for one in store.episodes], 20)
+        raise BadArgument(f"{store.path} has no such episode (--task, --episode); it has {names}.")
+    return episodes
 
 
 def _notes(stores: Sequence[Store]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from vla_attention.analyze.view.served_stores import ServedStore
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.progress_bar import progress_bar
+from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_place import refuse_in_store
 
@@ -69,12 +71,13 @@ def write_site(folder: Path, stores: Sequence[ServedStore], heads: bool) -> str:
     )
 
 
-def write_page_file(path: Path, store: ServedStore, heads: bool) -> str:
-    """Write a store of one episode as one HTML file; returns what was written, in words."""
-    runs = _packed(json.dumps(_runs([store], heads)).encode())
+def write_page_file(path: Path, store: ServedStore, episode: StoredEpisode, heads: bool) -> str:
+    """Write one episode of a store as one HTML file; returns what was written, in words."""
+    alone = replace(store, store=replace(store.store, episodes=(episode,)))
+    runs = _packed(json.dumps(_runs([alone], heads)).encode())
     within = {
         address.removesuffix(".gz"): base64.b64encode(content).decode()
-        for address, content in ((RUNS, runs), *_contents([store], heads))
+        for address, content in ((RUNS, runs), *_contents([store], heads, [episode]))
     }
     index, script, style = (
         (BUNDLE / name).read_text(encoding="utf-8") for name in ("index.html", "main.js", "main.css")
@@ -121,13 +124,18 @@ def _runs(stores: Sequence[ServedStore], heads: bool) -> dict[str, Any]:
     return runs_answer([store.store for store in stores], {}) | {"copy": {"heads": heads}}
 
 
-def _contents(stores: Sequence[ServedStore], heads: bool) -> Iterator[tuple[str, bytes]]:
-    """All answers but the first by their addresses, compressed; the summaries are complete."""
+def _contents(
+    stores: Sequence[ServedStore], heads: bool, only: Sequence[StoredEpisode] = ()
+) -> Iterator[tuple[str, bytes]]:
+    """All answers but the first by their addresses, compressed; the summaries are complete.
+
+    only: of one store the episodes that are meant; effects are in units of the whole store all the same.
+    """
     answers = Answers()
-    with progress_bar(sum(len(store.store.episodes) for store in stores), "episodes") as advance:
+    with progress_bar(len(only) or sum(len(store.store.episodes) for store in stores), "episodes") as advance:
         for number, store in enumerate(stores):
             yield f"runs/{number}/numbers.json.gz", _packed(json.dumps(store.summary.document()).encode())
-            for episode in store.store.episodes:
+            for episode in only or store.store.episodes:
                 for path, content in _compressed(answers.copied(store, episode.name, heads)):
                     yield f"runs/{number}/{episode.name}/{path}", content
                 advance(1)

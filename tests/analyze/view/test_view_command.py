@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import vla_attention as va
+from tests.kit.planted_effects import planted_effects
 from tests.kit.stopped_programs import after_call, run_stopped
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.viewer import ask, served
@@ -20,7 +21,7 @@ from vla_attention.analyze.view.paths import PAGE_FILES
 from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.schemas.stores.reader import open_store
 
-SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2)
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, plant_effects=planted_effects())
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +113,16 @@ def test_one_episode_is_one_file(store, tmp_path, capsys):
     (entry,) = json.loads(within["runs.json"])["runs"]
     assert [line["name"] for line in entry["episodes"]] == ["task001_episode001"]
     with served(store) as running:
-        for name in ("about.json", "joint/rows/mean.npy", "joint/groups/mean/mean.json"):
+        for name in ("about.json", "effects.json", "joint/rows/mean.npy", "joint/groups/mean/mean.json"):
             address = f"runs/0/task001_episode001/{name}"
             assert within[address] == ask(running, address).body
     assert main(["view", str(store), "--file", str(path), "--task", "7"]) == 2
     assert "it has task000_episode000" in capsys.readouterr().err
+    no, other = ["--file", str(tmp_path / "no.html")], write_store(tmp_path / "b.zarr", spec=SPEC)
+    for wrong in ([*no, "--site", str(tmp_path / "site")], [str(other), *no]):
+        assert main(["view", str(store), *wrong]) == 2
+    assert not (tmp_path / "no.html").exists()
+    assert not (tmp_path / "site").exists()
 
 
 @pytest.mark.parametrize("place", ["a.zarr", "file", "full", "hub/datasets"])

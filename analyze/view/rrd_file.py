@@ -1,0 +1,326 @@
+"""An episode as a Rerun recording (`.rrd`): pictures, words, numbers, poses and events on one time line.
+
+Times are steps of the environment: a replan stands at the number of steps before it, a pose at the step that led to it.
+Numbers are means over layers, denoise steps and heads, the same as on the page. Entities:
+
+    about                      what happened, and what the numbers are
+    pictures/CAMERA            what the policy got, as a person sees the scene; below it the lines around the patches
+                               that get so many times even attention, pictures/CAMERA/2 times even
+    words                      the instruction with attention and effect of every word, as a table
+    ratio, masses, attention   by replan: the ratio and what even attention gives; mass of groups; times even of words
+    effects                    by replan: how the action changes without an item, in its units
+    scene                      by step: hand and objects in 3D, in metres
+    actions                    by step: what was executed, a number a dimension
+    events                     touches, reached goals, closings of the gripper, the end
+
+Where a run has several sites, SITE stands before words, ratio, masses and attention.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vla_attention.analyze.core.action_changes import ActionSpread, units_of_recorded
+from vla_attention.analyze.core.camera_maps import (
+    EpisodeMaps,
+    episode_maps,
+    line_levels,
+    scale_end,
+    seen_cameras,
+    upright,
+)
+from vla_attention.analyze.render.files import replacing, writing
+from vla_attention.analyze.render.pictures import borders
+from vla_attention.analyze.render.style import group_styles
+from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode
+from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
+from vla_attention.schemas.errors import MissingDependency, plural
+from vla_attention.schemas.progress_bar import progress_bar
+from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+
+if TYPE_CHECKING:
+    import rerun
+
+SUFFIX = ".rrd"
+TIMELINE = "step"
+#: The oldest release that has every call below; LeRobot 0.4 takes it, too.
+OLDEST = (0, 24)
+#: Colours of the lines, the first around the larger part; half their width in pixels of the screen.
+_LINES = ((0x00, 0xB5, 0xCC), (0xE0, 0x40, 0xA0))
+_WIDE = 1.2
+#: Curves that others are held against, and their colour, which light and dark viewers show.
+_BASELINES, _BASELINE_COLOR = ("spread evenly", "another noise seed"), "#8F8F8F"
+#: An action in a simulator of ours.
+_ACTIONS = ("x", "y", "z", "turn x", "turn y", "turn z", "gripper")
+#: Lengths of the hand's axes in metres, and of half an object's mark.
+_AXES, _MARK = 0.05, 0.012
+_AXIS_COLORS = ((0xD5, 0x5E, 0x00), (0x00, 0x9E, 0x73), (0x00, 0x72, 0xB2))
+
+
+def rerun_library() -> Any:
+    """Rerun's Python library.
+
+    Raises:
+        MissingDependency: it is not installed, or older than `OLDEST`.
+    """
+    install = "pip install 'vla-attention[rerun]'"
+    try:
+        import rerun
+    except ImportError:
+        raise MissingDependency(f"A Rerun recording needs rerun-sdk, which is not installed: {install}.") from None
+    if tuple(int(part) for part in rerun.__version__.split(".")[:2]) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise MissingDependency(
+            f"A Rerun recording needs rerun-sdk {oldest} or later, and {rerun.__version__} is installed: {install}."
+        )
+    return rerun
+
+
+def write_recordings(path: Path, store: Store, episodes: Sequence[StoredEpisode]) -> str:
+    """Write episodes of a store; returns what was written, in words.
+
+    path: a file NAME.rrd for one episode, or a folder that gets a file an episode.
+    """
+    rr = rerun_library()
+    units = units_of_recorded(store) if any(one.attributes.effects for one in store.episodes) else None
+    size = 0
+    with writing("recordings", path, "another --rrd"), progress_bar(len(episodes), "episodes") as advance:
+        for episode in episodes:
+            file = path if path.suffix == SUFFIX else path / f"{episode.name}{SUFFIX}"
+            with replacing(file) as temporary:
+                _write(rr, temporary, ShownEpisode(store, episode), units)
+            if not size and len(episodes) > 1:
+                about = format_bytes(file.stat().st_size * len(episodes))
+                print(f"About {about} for {len(episodes)} episodes.", flush=True)
+            size += file.stat().st_size
+            advance(1)
+    opened = path if path.suffix == SUFFIX else path / f"*{SUFFIX}"
+    return f"{path}: {plural(len(episodes), 'episode')}, {format_bytes(size)}. Open with: rerun {opened}"
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """A recording that is being written."""
+
+    rr: Any
+    stream: rerun.RecordingStream
+
+    def log(self, parts: Sequence[str], what: Any, step: int | None = None) -> None:
+        """Log at a step; without one it holds throughout."""
+        if step is not None:
+            self.stream.set_time(TIMELINE, sequence=step)
+        self.stream.log(self._path(parts), what, static=step is None)
+
+    def columns(self, parts: Sequence[str], steps: Iterable[int], columns: Any) -> None:
+        """Log a row for each step."""
+        self.stream.send_columns(self._path(parts), [self.rr.TimeColumn(TIMELINE, sequence=list(steps))], columns)
+
+    def series(self, parts: Sequence[str], steps: Sequence[int], curves: Mapping[str, Sequence[float | None]]) -> None:
+        """Log curves by their names below `parts`, a number a step; null and what is not finite are gaps."""
+        colors = group_styles(list(curves))
+        for name, values in curves.items():
+            known = [
+                (step, value)
+                for step, value in zip(steps, values, strict=True)
+                if value is not None and math.isfinite(value)
+            ]
+            numbers = self.rr.Scalars.columns(scalars=[value for _, value in known])
+            self.columns([*parts, name], [step for step, _ in known], numbers)
+            color = _BASELINE_COLOR if name in _BASELINES else colors[name]["color"]
+            self.log([*parts, name], self.rr.SeriesLines(colors=[tuple(bytes.fromhex(color[1:]))], names=[name]))
+
+    def _path(self, parts: Sequence[str]) -> str:
+        return "/".join(self.rr.escape_entity_path_part(part) for part in parts)
+
+
+def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None) -> None:
+    """Write one episode."""
+    about = shown.about()
+    stream = rr.RecordingStream("vla-attention", recording_id=f"{shown.store.run} {shown.episode.name}")
+    sites = [site.name for site in shown.store.attributes.sites]
+    effects = [] if units is None else _effects(shown, units)
+    stream.save(str(path), default_blueprint=_blueprint(about, sites, bool(effects)))
+    recording = _Recording(rr, stream)
+    stream.send_recording_name(f"{shown.store.suite}: {about['told'] or about['instruction']} ({shown.episode.name})")
+    recording.log(["about"], rr.TextDocument(_about(shown, about), media_type=rr.MediaType.MARKDOWN))
+    for site in sites:
+        before = [site] if len(sites) > 1 else []
+        question = shown.question(site)
+        maps = episode_maps(question, shown.item(site), seen_cameras(shown.item(site)))
+        _log_pictures(recording, shown, maps, about["starts"])
+        _log_words(recording, before, maps, effects, about["starts"])
+        _log_groups(recording, before, shown.groups(site, MEAN, MEAN), about["starts"])
+    for kind in dict.fromkeys(item["item_kind"] for item in effects):
+        curves = {item["item"]: item["effect"] for item in effects if item["item_kind"] == kind}
+        recording.series(["effects", kind], about["starts"], curves)
+    _log_scene(recording, shown)
+    _log_actions(recording, shown, about)
+    for event in about["events"]:
+        recording.log(["events"], rr.TextLog(event["text"]), event["step"])
+    stream.disconnect()
+
+
+def _about(shown: ShownEpisode, about: Mapping[str, Any]) -> str:
+    root = shown.store.attributes
+    return (
+        f"**{about['verdict']}**\n\nSuite {visible(shown.store.suite)}, task {about['task']}, episode "
+        f"{about['episode']}; policy {visible(root.policy.name)}; run {shown.store.run[:8]}.\n\nAttention of the "
+        "action queries, mean over layers, denoise steps and heads. *Times even*: what a word or patch gets, divided "
+        "by what it would get if attention were spread evenly. *Effect*: how far the action moves without the item."
+    )
+
+
+def _effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, Any]]:
+    """The effects of taking an item away, or of other words, and the noise; from all queries where both were tried."""
+    found = shown.effects(units)
+    items = [] if found is None else found["items"]
+    readers = {item["reader"] for item in items}
+    reader = "total" if "total" in readers else "direct"
+    return [
+        item
+        for item in items
+        if item["kind"] in ("without", "prompt", "image", "noise") and item["reader"] in (None, reader)
+    ]
+
+
+def _log_pictures(recording: _Recording, shown: ShownEpisode, maps: EpisodeMaps, starts: Sequence[int]) -> None:
+    """What the policy got, with lines around the patches that get much more than even attention."""
+    rr = recording.rr
+    lifts = [one.lift.ravel() for one in maps.cameras.values()]
+    levels = line_levels(scale_end(np.concatenate(lifts))) if lifts else []
+    for camera, one in maps.cameras.items():
+        grid = one.picture.grids[0]
+        sides = float(grid.image_width), float(grid.image_height)
+        for replan, step in enumerate(starts):
+            if maps.has_frames(camera):
+                png = rr.EncodedImage(contents=shown.picture(camera, replan), media_type="image/png")
+                recording.log(["pictures", camera], png, step)
+            lift = upright(one.lift[replan], one.view)
+            for number, (level, color) in enumerate(zip(levels, _LINES, strict=False)):
+                lines = [
+                    (segment[:2], segment[2:]) for segment in borders(lift >= level, 0.1 * number, (0.0, 0.0), sides)
+                ]
+                drawn = rr.LineStrips2D(lines, colors=[color], radii=rr.Radius.ui_points(_WIDE))
+                recording.log(["pictures", camera, f"{level:g} times even"], drawn, step)
+
+
+def _log_words(
+    recording: _Recording,
+    before: Sequence[str],
+    maps: EpisodeMaps,
+    effects: Sequence[Mapping[str, Any]],
+    starts: Sequence[int],
+) -> None:
+    """Every word's attention, as a series and in a table beside its effect; a word that comes twice has a number."""
+    rr = recording.rr
+    effect_of = {item["item"]: item["effect"] for item in effects if item["item_kind"] == "word"}
+    curves: dict[str, list[float | None]] = {}
+    for replan, words in enumerate(maps.words):
+        lines, seen = ["| word | times even | effect |", "|---|---:|---:|"], Counter[str]()
+        for word, lift in words:
+            text = visible(word)
+            seen[text] += 1
+            name = text if seen[text] == 1 else f"{text} ({seen[text]})"
+            curves.setdefault(name, [None] * len(starts))[replan] = lift
+            effect = effect_of[f"'{text}'"][replan] if f"'{text}'" in effect_of else None
+            lines.append(f"| {text} | {lift:.2f} | {'' if effect is None else f'{effect:.2f}'} |")
+        table = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+        recording.log([*before, "words"], table, starts[replan])
+    recording.series([*before, "attention"], starts, curves)
+
+
+def _log_groups(recording: _Recording, before: Sequence[str], groups: Mapping[str, Any], starts: Sequence[int]) -> None:
+    """The ratio, and the mass of every group that has any: mean of the layers, which is the last one."""
+    masses = {name: [line[-1] for line in group["mass"]] for name, group in groups["groups"].items()}
+    recording.series([*before, "masses"], starts, {name: values for name, values in masses.items() if any(values)})
+    if groups["sides"]:
+        ratios = {"ratio": groups["ratio"], "spread evenly": groups["uniform_ratio"]}
+        recording.series([*before, "ratio"], starts, {name: [line[-1] for line in of] for name, of in ratios.items()})
+
+
+def _log_scene(recording: _Recording, shown: ShownEpisode) -> None:
+    """Hand and objects where they were at every step; the hand with the axes of its own frame and its way."""
+    steps = shown.episode.attributes.steps
+    if steps is None:
+        return
+    rr, poses = recording.rr, shown.episode.read(POSES).astype(np.float64)  # (moment, body, position and w, x, y, z)
+    recording.log(["scene"], rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    for i, body in enumerate(steps.bodies):
+        name = visible(body.replace("_", " "))
+        turned = np.roll(poses[:, i, 3:], -1, axis=1)  # Rerun has w last
+        moved = rr.Transform3D.columns(translation=poses[:, i, :3], quaternion=turned)
+        recording.columns(["scene", name], range(len(poses)), moved)
+        if body == HAND:
+            axes = rr.Arrows3D(vectors=np.eye(3) * _AXES, colors=_AXIS_COLORS, radii=_AXES / 16)
+            recording.log(["scene", name, "axes"], axes)
+            way = rr.LineStrips3D([poses[:, i, :3]], colors=[(0x88, 0x88, 0x88)], radii=_AXES / 40)
+            recording.log(["scene", "way of the hand"], way)
+        else:
+            named = body in shown.named
+            color = (0xE6, 0x9F, 0x00) if named else (0x99, 0x99, 0x99)
+            label = name + " (named)" * named
+            recording.log(["scene", name, "mark"], rr.Boxes3D(half_sizes=[_MARK] * 3, colors=[color], labels=[label]))
+
+
+def _log_actions(recording: _Recording, shown: ShownEpisode, about: Mapping[str, Any]) -> None:
+    """Every executed action; of a loop that is not ours the chunks' actions up to the next replan."""
+    steps: Sequence[int]
+    names: Sequence[str]
+    if shown.episode.attributes.steps is not None:
+        actions = shown.episode.read(EXECUTED)
+        steps, names = range(len(actions)), _ACTIONS
+    elif shown.episode.has("actions"):
+        starts, chunks = about["starts"], shown.episode.read("actions")  # (replan, step, dimension)
+        ends = [*starts[1:], about["end"]]
+        taken = [chunk[: end - start] for start, end, chunk in zip(starts, ends, chunks, strict=True)]
+        actions = np.concatenate(taken)
+        steps = [start + i for start, chunk in zip(starts, taken, strict=True) for i in range(len(chunk))]
+        names = [str(i) for i in range(actions.shape[1])]
+    else:
+        return
+    curves = {name: values.astype(float).tolist() for name, values in zip(names, actions.T, strict=True)}
+    recording.series(["actions"], steps, curves)
+
+
+def _blueprint(about: Mapping[str, Any], sites: Sequence[str], effects: bool) -> Any:
+    """Pictures, words and scene on the left, numbers over time on the right."""
+    import rerun.blueprint as rrb
+
+    cameras = dict.fromkeys(camera for site in about["sites"].values() for camera in site["cameras"])
+    spelled = [site for site in sites if any(prompt["words"] for prompt in about["sites"][site]["prompts"])]
+    before = {site: f"/{site}" if len(sites) > 1 else "" for site in sites}
+    left = [
+        rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/pictures/{camera}", name=camera) for camera in cameras]),
+        rrb.Horizontal(
+            rrb.Vertical(
+                rrb.TextDocumentView(origin="/about", name="episode"),
+                *[rrb.TextDocumentView(origin=f"{before[site]}/words", name="words") for site in spelled],
+            ),
+            *([rrb.Spatial3DView(origin="/scene", name="scene (m)")] if about["courses"] else []),
+        ),
+        rrb.TextLogView(origin="/events", name="events"),
+    ]
+    plots: list[tuple[str, str, Sequence[str]]]
+    plots = [(f"{before[site]}/ratio", "ratio, and if spread evenly", ()) for site in sites]
+    plots += [(f"{before[site]}/masses", "attention on groups", ()) for site in sites]
+    plots += [(f"{before[site]}/attention", "words: times even attention", ()) for site in spelled]
+    if effects:
+        plots.append(("/effects", "how far the action moves without a word", ("/effects/word/**", "/effects/noise/**")))
+    if about["courses"] or about["actions"]:
+        plots.append(("/actions", "actions", ()))
+    right = rrb.Vertical(
+        *[rrb.TimeSeriesView(origin=at, contents=of or "$origin/**", name=name) for at, name, of in plots]
+    )
+    closed = [panel(state="collapsed") for panel in (rrb.BlueprintPanel, rrb.SelectionPanel, rrb.TimePanel)]
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Vertical(*left, row_shares=[3, 4, 2]), right, column_shares=[3, 2]), *closed
+    )

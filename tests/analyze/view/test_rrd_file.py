@@ -1,0 +1,173 @@
+"""`vla-attention view --rrd`: what Rerun's own reader finds in a recording, against the store and the analysis."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from PIL import Image
+
+import vla_attention as va
+from tests.kit.planted_effects import planted_effects
+from tests.kit.site_stores import write_site_store
+from tests.kit.stores import StoreSpec, small_steps, write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.schemas.stores.reader import StoredEpisode, open_store
+
+SPEC = StoreSpec(tasks=(0, 1), replans=3, plant_effects=planted_effects(), plant_steps=small_steps)
+
+
+def test_a_library_that_is_missing_or_too_old_is_named(tmp_path, capsys, monkeypatch):
+    store = write_store(tmp_path / "a.zarr", spec=replace(SPEC, tasks=(0,), episodes=1))
+    for library in (None, SimpleNamespace(__version__="0.23.4")):
+        monkeypatch.setitem(sys.modules, "rerun", library)
+        assert main(["view", str(store), "--rrd", str(tmp_path / "a.rrd")]) == 2
+        said = capsys.readouterr().err
+        assert "pip install 'vla-attention[rerun]'" in said
+        assert ("0.23.4" in said) == (library is not None)
+    assert not (tmp_path / "a.rrd").exists()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("recorded") / "a.zarr", spec=SPEC)
+
+
+@pytest.fixture(scope="module")
+def rerun() -> Any:
+    return pytest.importorskip("rerun", reason="rerun-sdk is half a gigabyte: make test-rerun")
+
+
+def logged(path: Path) -> dict[str, dict[str, dict[int | None, Any]]]:
+    """Entity -> column -> step (None: throughout) -> what was logged there; Rerun's reader has read it."""
+    reader = pytest.importorskip("rerun.chunk", reason="only newer releases of rerun-sdk have this reader")
+    found: dict[str, dict[str, dict[int | None, Any]]] = {}
+    for chunk in reader.RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch().to_pydict()
+        steps = batch.pop("step", [None] * chunk.num_rows)
+        for name, values in batch.items():
+            column = found.setdefault(chunk.entity_path.replace("\\", ""), {}).setdefault(name, {})
+            column.update((step, value) for step, value in zip(steps, values, strict=True) if value is not None)
+    return found
+
+
+@pytest.fixture(scope="module")
+def recording(store, rerun, tmp_path_factory) -> dict[str, dict[str, dict[int | None, Any]]]:
+    path = tmp_path_factory.mktemp("recorded") / "one.rrd"
+    assert main(["view", str(store), "--rrd", str(path), "--task", "1", "--episode", "0"]) == 0
+    return logged(path)
+
+
+@pytest.fixture
+def episode(store) -> StoredEpisode:
+    (found,) = [one for one in open_store(store).episodes if one.name == "task001_episode000"]
+    return found
+
+
+@pytest.fixture
+def starts(store) -> list[int]:
+    """Policy steps before each replan of the episode."""
+    opened = open_store(store)
+    (found,) = [one for one in opened.episodes if one.name == "task001_episode000"]
+    return (found.read("env_step").astype(int) - opened.attributes.protocol.wait_steps).tolist()
+
+
+def curves(recording, below: str) -> dict[str, dict[int, float]]:
+    """Name -> step -> number, of the curves below an entity."""
+    return {
+        entity.removeprefix(f"/{below}/"): {step: value[0] for step, value in columns["Scalars:scalars"].items()}
+        for entity, columns in recording.items()
+        if entity.startswith(f"/{below}/")
+    }
+
+
+def by_step(frame: pl.DataFrame | pl.LazyFrame, value: str, starts: list[int]) -> dict[int, float]:
+    """A column of the episode's rows of replans, by the step of the replan."""
+    rows = frame.lazy().filter(task_id=1, episode_index=0).sort("replan").select("replan", value).collect()
+    return {starts[replan]: number for replan, number in rows.iter_rows() if number is not None}
+
+
+def test_ratio_masses_and_effects_are_those_of_the_analysis(store, recording, starts):
+    tables = va.open(store).analyze(by="replan")
+    averages = tables["replans"].lazy().filter(layer="layers_avg")
+    ratio = curves(recording, "ratio")
+    assert ratio["ratio"] == pytest.approx(by_step(averages, "ratio", starts))
+    assert ratio["spread evenly"] == pytest.approx(by_step(averages, "uniform_ratio", starts))
+    groups = tables["replans_groups"].lazy().filter(layer="layers_avg")
+    masses = curves(recording, "masses")
+    assert {"visual", "linguistic"} < masses.keys()
+    for name, values in masses.items():
+        assert values == pytest.approx(by_step(groups.filter(group=name), "mass", starts))
+    # In units of the whole store: of one episode's actions they would be others.
+    effects = va.open(store).effects()["effects"].lazy().filter(kind="without", reader="total")
+    words = curves(recording, "effects/word")
+    assert len(words) > 1
+    for name, values in words.items():
+        assert values == pytest.approx(by_step(effects.filter(item=name), "effect", starts))
+
+
+def test_words_have_what_their_keys_get_over_even_attention(store, recording, starts):
+    frame = va.open(store).overlay(episode=0, tasks=[1]).figures[0].frame
+    for row in frame.iter_rows(named=True):
+        step = starts[row["replan"]]
+        table = recording["/words"]["TextDocument:text"][step][0]
+        assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == row["words"]
+        shown = {word: values[step] for word, values in curves(recording, "attention").items() if step in values}
+        assert sorted(shown.values()) == pytest.approx(sorted(row["lifts"]))
+    assert frame.height
+
+
+def test_pictures_are_the_stored_ones_and_lines_go_around_what_gets_twice_even(store, episode, recording, starts):
+    frame = va.open(store).overlay(episode=0, tasks=[1]).figures[0].frame
+    views = {view.name: view for view in open_store(store).attributes.policy.cameras}
+    drawn = 0
+    for row in frame.iter_rows(named=True):
+        camera, step = row["camera"], starts[row["replan"]]
+        blob = recording[f"/pictures/{camera}"]["EncodedImage:blob"][step][0]
+        stored = episode.read(f"frames/{camera}", row["replan"])
+        down, across = (1 if views[camera].upright else -1), (-1 if views[camera].mirrored else 1)
+        picture = np.asarray(Image.open(io.BytesIO(bytes(blob))))
+        np.testing.assert_array_equal(picture, stored[::down, ::across])
+        inside = np.pad(np.array(row["map"]) >= 2, 1)
+        borders = (inside[1:] != inside[:-1]).sum() + (inside[:, 1:] != inside[:, :-1]).sum()
+        strips = recording[f"/pictures/{camera}/2 times even"]["LineStrips2D:strips"].get(step, [])
+        assert len(strips) == borders
+        assert all(0 <= x <= picture.shape[1] and 0 <= y <= picture.shape[0] for strip in strips for x, y in strip)
+        drawn += len(strips)
+    assert drawn
+
+
+def test_hand_objects_actions_and_events_are_those_of_the_steps(episode, recording):
+    steps, poses = episode.attributes.steps, episode.read("steps/poses")
+    for i, body in enumerate(steps.bodies):
+        columns = recording[f"/scene/{body.replace('_', ' ')}"]
+        for step, pose in enumerate(poses[:, i]):
+            np.testing.assert_allclose(columns["Transform3D:translation"][step][0], pose[:3], rtol=1e-6)
+            x, y, z, w = columns["Transform3D:quaternion"][step][0]
+            np.testing.assert_allclose((w, x, y, z), pose[3:], rtol=1e-6, atol=1e-7)
+    actions = curves(recording, "actions")
+    for name, executed in zip(
+        ("x", "y", "z", "turn x", "turn y", "turn z", "gripper"), episode.read("steps/actions").T, strict=True
+    ):
+        assert list(actions[name].values()) == pytest.approx(executed.tolist())
+    events = {step: text[0] for step, text in recording["/events"]["TextLog:text"].items()}
+    assert events[steps.first_touch[1]].startswith("touches")
+
+
+@pytest.mark.parametrize("kind", ["alternating", "split", "growing"])
+def test_every_episode_of_other_policies_is_one_whole_file(tmp_path, rerun, capsys, kind):
+    store = write_site_store(tmp_path / "a.zarr", kind=kind)
+    assert main(["view", str(store), "--rrd", str(tmp_path / "out")]) == 0
+    said, files = capsys.readouterr().out, sorted((tmp_path / "out").iterdir())
+    assert said.startswith("About ")
+    assert [file.stem for file in files] == [one.name for one in open_store(store).episodes]
+    program = Path(sys.executable).with_name("rerun")
+    subprocess.run([program, "rrd", "verify", *files], check=True, capture_output=True)
