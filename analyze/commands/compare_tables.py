@@ -10,9 +10,10 @@ import polars as pl
 from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.compared import KINDS, Compared, RunValues, side_by_side, strip_of_pair
 from vla_attention.analyze.core.object_shares import CLASSES
+from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
-from vla_attention.schemas.errors import plural, shortened
+from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.safe_text import visible
 
 ALL = pl.col("scope") == "all"
@@ -57,37 +58,28 @@ def perturbed(
 ) -> tuple[list[Finding], list[Table]]:
     """By what LIBERO-PRO changed: success, doing what was told, attention to what the task names; none without it.
 
-    Every task weighs the same. `pairs`: of episodes that begin alike in the first run; its suites share no states.
+    `pairs`: of episodes that begin alike in the first run; its suites share no states.
     """
-    runs = [(base, None), *((part.other, part.pairs) for part in parts if not part.other.run.repeats(base.run))]
-    kind = pl.col("suite").str.extract("^libero_pro_.+_(.+)$").replace_strict(_CHANGED, default=None)
-    if all(one.episodes.filter(kind.is_not_null()).is_empty() for one, _ in runs):
+    ran = [(part.other, part.pairs) for part in parts if not part.other.run.repeats(base.run)]
+    every = [(base, None), *ran]
+    if not any_perturbed(suite for one, _ in every for suite in one.run.suites):
         return [], []
     found = []
-    for one, pairs in runs:
-        rows, means = one.episodes.select(EPISODE_ID), pl.mean("solved", "did", "named")
+    for one, pairs in every:
         no_objects = one.episodes.select(*EPISODE_ID, kind=None, item=None, value=pl.lit(None, pl.Float64))
         named = one.values.get("objects", no_objects).filter(kind="class", item=CLASSES[0])
+        rows = one.episodes.select(EPISODE_ID)
         for values in (
             one.values["groups"].filter(quantity="success").unique(EPISODE_ID).select(*EPISODE_ID, solved="value"),
-            told[one.run.name].select(*EPISODE_ID, did=pl.col("did").eq_missing("told").cast(pl.Float64)),
             named.select(*EPISODE_ID, named="value"),
         ):
             rows = rows.join(values, on=EPISODE_ID, how="left")
-        tasks = rows.group_by("suite", "task_id").agg(pl.len().alias("num_episodes"), means)
-        suites = tasks.group_by("suite").agg(pl.sum("num_episodes"), means).sort("suite")
+        suites = by_suite(rows, told[one.run.name])
         num_pairs = [None if pairs is None else pairs.filter(suite=suite).height for suite in suites["suite"]]
         run, of_pairs = pl.lit(one.run.name).alias("run"), pl.Series("pairs", num_pairs, pl.Int64)
         found.append(suites.select(run, pl.all()).with_columns(of_pairs))
-    table = pl.concat(found).with_columns(named=2.0 ** pl.col("named"), kind=kind.fill_null("nothing"))
-    said = [
-        f"{row['kind']} ({row['run']}): {plural(row['num_episodes'], 'episode')}, "
-        + ", ".join(how.format(row[name]) for name, how in _SAID.items() if row[name] is not None)
-        for row in table.iter_rows(named=True)
-    ]
-    limit = "Not paired where pairs is 0, so differences of scenes are in it: each suite has initial states of its own."
-    finding = Finding(f"{'; '.join(said)}.", "By what was changed?", limit=limit if (table["pairs"] == 0).any() else "")
-    return [finding], [Table("perturbations", table, _PERTURBED, "By what LIBERO-PRO changed")]
+    finding, table = perturbations(pl.concat(found))
+    return [finding], [table]
 
 
 def _named_after(column: Column, names: Mapping[str, str]) -> Column:
@@ -137,19 +129,6 @@ def as_factors(rows: pl.DataFrame) -> pl.DataFrame:
     return found.rename({**ends, "difference_q": "times_q"})
 
 
-#: What a suite of LIBERO-PRO changes, by the end of its name.
-_CHANGED = {"lan": "the sentence", "object": "an object", "swap": "places", "task": "the task"}
-_SAID = {"solved": "{:.0%} solved", "did": "{:.0%} did as told", "named": "{:.2g} times the attention on what is named"}
-_PERTURBED = [
-    Column("kind", "text", "changed"),
-    Column("run", "text"),
-    Column("suite", "text"),
-    Column("solved", "percent"),
-    Column("did", "percent", "did as told"),
-    Column("named", "factor", "on what it names", "attention to the objects that the task names, over their area's"),
-    Column("num_episodes", "count", "episodes"),
-    Column("pairs", "count", "pairs", "with the first run, from the same initial states; 0: not paired"),
-]
 _LOOK = {"value": "difference", "baseline": 0.0, "baseline_name": "the same", "xlabel": "difference of the shares"}
 _FACTORS = {**_LOOK, "value": "times", "baseline": 1.0, "log": True}
 _BARS = "Points: means over episodes, every task weighing the same; bars: 95% intervals."

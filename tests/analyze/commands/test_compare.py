@@ -8,9 +8,10 @@ import pytest
 from msgspec import structs
 from scipy import stats
 
+import vla_attention as va
 from tests.kit.archives import example_store
 from tests.kit.questions import with_attributes
-from tests.kit.stores import StoreSpec, rerun_source, write_store
+from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.compare import compare
 from vla_attention.analyze.core import runs as runs_module
@@ -150,8 +151,9 @@ def test_a_run_of_several_stores_is_compared_suite_by_suite(stores):
 
 def test_what_libero_pro_changed_is_told_apart_and_paired_where_states_are_shared(tmp_path):
     goal, lan, one_task = "libero_goal", "libero_pro_goal_lan", {"tasks": (0,), "episodes": 1}
+    seen = {"coverage": True, "plant_steps": small_steps}
     specs = {
-        "base": replace(PLAIN, suite=goal), "lan": replace(PLAIN, suite=lan),
+        "base": replace(PLAIN, suite=goal, **seen), "lan": replace(PLAIN, suite=lan, **seen),
         "tuned": replace(PLAIN, suite=lan, policy="tuned"),
         "few": replace(PLAIN, suite=goal, **one_task), "few_object": replace(PLAIN, suite=f"{goal}_object", **one_task),
     }  # fmt: skip
@@ -169,6 +171,13 @@ def test_what_libero_pro_changed_is_told_apart_and_paired_where_states_are_share
     found = compare(opened(stores, "base", "lan", allowed=("suite",)), ("suite",))
     assert found["perturbations"]["pairs"].to_list() == [None, 0]
     assert found.findings[0].limit.startswith("Not paired")
+    # The same for one run, from `language`; a made-up episode reaches the told goal if it is solved.
+    told = va.open([stores["base"], stores["lan"]]).language()["perturbations"]
+    kept = ["kind", "suite", "num_episodes", "solved", "did"]
+    assert told.select(kept).equals(found["perturbations"].select(kept))
+    assert told["did"].to_list() == told["solved"].to_list() == [share, share]
+    assert told["named"].null_count() == 0
+    assert told["named"].to_list() == pytest.approx(found["perturbations"]["named"].to_list())
     # Without an interval anywhere, and without LIBERO-PRO.
     found = compare(opened(stores, "few", "few_object", allowed=("suite",)), ("suite",))
     assert "perturbations" not in [table.name for table in found.tables]

@@ -1,0 +1,69 @@
+"""What a policy does where LIBERO-PRO changed something: a row for each suite, by what was changed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+import polars as pl
+
+from vla_attention.analyze.core.result import Column, Finding, Table
+from vla_attention.schemas.errors import plural
+
+#: What a suite of LIBERO-PRO changes, by the end of its name.
+_CHANGED = {"lan": "the sentence", "object": "an object", "swap": "places", "task": "the task"}
+_SUITE = re.compile(rf"libero_pro_.+_({'|'.join(_CHANGED)})")
+_SAID = {
+    "solved": "{:.0%} solved",
+    "did": "{:.0%} did as told",
+    "named": "what is named gets {:.2g} times its area's share of the attention",
+}
+_COLUMNS = [
+    Column("kind", "text", "changed"),
+    Column("run", "text"),
+    Column("suite", "text"),
+    Column("solved", "percent"),
+    Column("did", "percent", "did as told"),
+    Column("named", "factor", "on what it names", "attention to the objects that the task names, over their area's"),
+    Column("num_episodes", "count", "episodes"),
+    Column("pairs", "count", "pairs", "with the first run, from the same initial states; 0: not paired"),
+]
+
+
+def any_perturbed(suites: Iterable[str]) -> bool:
+    """Whether one of the suites is LIBERO-PRO's."""
+    return any(_SUITE.fullmatch(suite) for suite in suites)
+
+
+def by_suite(rows: pl.DataFrame, asked: pl.DataFrame) -> pl.DataFrame:
+    """A row a suite: kind (what was changed), suite, solved, did, named, num_episodes. Every task weighs the same.
+
+    Args:
+        rows: of each episode suite, task_id, episode_index, solved (0 or 1) and named, log2 of the attention to what
+            the task names over what its area gives it; null where that is not known.
+        asked: of `behaviour`: what was told and done.
+    """
+    as_told = pl.col("did").eq_missing(pl.col("told")).cast(pl.Float64)
+    did = asked.select("suite", "task_id", "episode_index", did=as_told)
+    rows = rows.join(did, on=("suite", "task_id", "episode_index"), how="left")
+    means = [pl.mean("solved", "did", "named")]
+    tasks = rows.group_by("suite", "task_id").agg(pl.len().alias("num_episodes"), *means)
+    suites = tasks.group_by("suite").agg(pl.sum("num_episodes"), *means).sort("suite")
+    kinds = [_CHANGED[found[1]] if (found := _SUITE.fullmatch(suite)) else "nothing" for suite in suites["suite"]]
+    return suites.with_columns(named=2.0 ** pl.col("named"), kind=pl.Series(kinds, dtype=pl.String))
+
+
+def perturbations(table: pl.DataFrame) -> tuple[Finding, Table]:
+    """The rows of `by_suite` of one or several runs (run, pairs) in a sentence, and as a table."""
+    several = "run" in table.columns
+    said = []
+    for row in table.iter_rows(named=True):
+        values = [how.format(row[name]) for name, how in _SAID.items() if row[name] is not None]
+        run = f" ({row['run']})" if several else ""
+        said.append(f"{row['kind']} changed{run}: {', '.join([plural(row['num_episodes'], 'episode'), *values])}")
+    apart = not several or (table["pairs"] == 0).any()
+    limit = "Not paired, so differences of scenes are in it: each suite has initial states of its own." if apart else ""
+    columns = [column for column in _COLUMNS if column.name in table.columns]
+    shown = Table("perturbations", table, columns, "By what LIBERO-PRO changed")
+    sentence = "; ".join(said)
+    return Finding(f"{sentence[0].upper()}{sentence[1:]}.", "By what was changed?", limit=limit), shown
