@@ -51,7 +51,8 @@ def logged(path: Path) -> dict[str, dict[str, dict[int | None, Any]]]:
     reader = pytest.importorskip("rerun.chunk", reason="only newer releases of rerun-sdk have this reader")
     found: dict[str, dict[str, dict[int | None, Any]]] = {}
     for chunk in reader.RrdReader(path).stream().to_chunks():
-        batch = chunk.to_record_batch().to_pydict()
+        read = chunk.to_record_batch()
+        batch = {name: read.column(name).to_pylist() for name in read.schema.names if name != "log_time"}
         steps = batch.pop("step", [None] * chunk.num_rows)
         for name, values in batch.items():
             column = found.setdefault(chunk.entity_path.replace("\\", ""), {}).setdefault(name, {})
