@@ -30,6 +30,9 @@ The page is served to this machine only, to whoever has the printed link, until 
 place. With the same stores and the same --port the link stays the same.
 """
 
+#: Options that say what is written, and with which of those that write they go.
+_OPTIONS_OF = {"task": ("--file", "--rrd"), "episode": ("--file", "--rrd"), "heads": ("--file", "--site")}
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-attention view STORE ...`."""
@@ -83,6 +86,10 @@ def run(arguments: argparse.Namespace) -> int:
     written = [name for name in ("--file", "--rrd", "--site") if getattr(arguments, name.strip("-")) is not None]
     if len(written) > 1:
         raise BadArgument(f"{' and '.join(written)} are two things to write; give one of them.")
+    for option, of in _OPTIONS_OF.items():
+        given = getattr(arguments, option)
+        if given is not None and given is not False and not {*of} & {*written}:
+            raise BadArgument(f"--{option} is an option of {' and '.join(of)}; add one of them, or leave it out.")
     if len(places) > 1 and written not in ([], ["--site"]):
         raise BadArgument(f"{written[0]} writes episodes of one store, and {len(places)} are given; give one.")
     if arguments.rrd is not None:

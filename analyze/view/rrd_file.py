@@ -13,14 +13,14 @@ Numbers are means over layers, denoise steps and heads, the same as on the page.
     actions                    by step: what was executed, a number a dimension
     events                     touches, reached goals, closings of the gripper, the end
 
-Where a run has several sites, SITE stands before words, ratio, masses and attention.
+Where a run has several sites, SITE stands before pictures, words, ratio, masses and attention.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,11 +118,11 @@ class _Recording:
         """Log at a step; without one it holds throughout."""
         if step is not None:
             self.stream.set_time(TIMELINE, sequence=step)
-        self.stream.log(self._path(parts), what, static=step is None)
+        self.stream.log(_path(self.rr, parts), what, static=step is None)
 
     def columns(self, parts: Sequence[str], steps: Iterable[int], columns: Any) -> None:
         """Log a row for each step."""
-        self.stream.send_columns(self._path(parts), [self.rr.TimeColumn(TIMELINE, sequence=list(steps))], columns)
+        self.stream.send_columns(_path(self.rr, parts), [self.rr.TimeColumn(TIMELINE, sequence=list(steps))], columns)
 
     def series(self, parts: Sequence[str], steps: Sequence[int], curves: Mapping[str, Sequence[float | None]]) -> None:
         """Log curves by their names below `parts`, a number a step; null and what is not finite are gaps."""
@@ -133,13 +133,12 @@ class _Recording:
                 for step, value in zip(steps, values, strict=True)
                 if value is not None and math.isfinite(value)
             ]
+            if not known:
+                continue
             numbers = self.rr.Scalars.columns(scalars=[value for _, value in known])
             self.columns([*parts, name], [step for step, _ in known], numbers)
             color = _BASELINE_COLOR if name in _BASELINES else colors[name]["color"]
             self.log([*parts, name], self.rr.SeriesLines(colors=[tuple(bytes.fromhex(color[1:]))], names=[name]))
-
-    def _path(self, parts: Sequence[str]) -> str:
-        return "/".join(self.rr.escape_entity_path_part(part) for part in parts)
 
 
 def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None) -> None:
@@ -148,7 +147,8 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None)
     stream = rr.RecordingStream("vla-attention", recording_id=f"{shown.store.run} {shown.episode.name}")
     sites = [site.name for site in shown.store.attributes.sites]
     effects = [] if units is None else _effects(shown, units)
-    stream.save(str(path), default_blueprint=_blueprint(about, sites, bool(effects)))
+    kinds = dict.fromkeys(item["item_kind"] for item in effects)
+    stream.save(str(path), default_blueprint=_blueprint(rr, about, kinds))
     recording = _Recording(rr, stream)
     stream.send_recording_name(f"{shown.store.suite}: {about['told'] or about['instruction']} ({shown.episode.name})")
     recording.log(["about"], rr.TextDocument(_about(shown, about), media_type=rr.MediaType.MARKDOWN))
@@ -156,10 +156,10 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None)
         before = [site] if len(sites) > 1 else []
         question = shown.question(site)
         maps = episode_maps(question, shown.item(site), seen_cameras(shown.item(site)))
-        _log_pictures(recording, shown, maps, about["starts"])
+        _log_pictures(recording, before, shown, maps, about["starts"])
         _log_words(recording, before, maps, effects, about["starts"])
         _log_groups(recording, before, shown.groups(site, MEAN, MEAN), about["starts"])
-    for kind in dict.fromkeys(item["item_kind"] for item in effects):
+    for kind in kinds:
         curves = {item["item"]: item["effect"] for item in effects if item["item_kind"] == kind}
         recording.series(["effects", kind], about["starts"], curves)
     _log_scene(recording, shown)
@@ -192,25 +192,26 @@ def _effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, Any]]:
     ]
 
 
-def _log_pictures(recording: _Recording, shown: ShownEpisode, maps: EpisodeMaps, starts: Sequence[int]) -> None:
+def _log_pictures(
+    recording: _Recording, before: Sequence[str], shown: ShownEpisode, maps: EpisodeMaps, starts: Sequence[int]
+) -> None:
     """What the policy got, with lines around the patches that get much more than even attention."""
     rr = recording.rr
     lifts = [one.lift.ravel() for one in maps.cameras.values()]
     levels = line_levels(scale_end(np.concatenate(lifts))) if lifts else []
     for camera, one in maps.cameras.items():
-        grid = one.picture.grids[0]
+        place, grid = [*before, "pictures", camera], one.picture.grids[0]
         sides = float(grid.image_width), float(grid.image_height)
         for replan, step in enumerate(starts):
             if maps.has_frames(camera):
                 png = rr.EncodedImage(contents=shown.picture(camera, replan), media_type="image/png")
-                recording.log(["pictures", camera], png, step)
+                recording.log(place, png, step)
             lift = upright(one.lift[replan], one.view)
             for number, (level, color) in enumerate(zip(levels, _LINES, strict=False)):
-                lines = [
-                    (segment[:2], segment[2:]) for segment in borders(lift >= level, 0.1 * number, (0.0, 0.0), sides)
-                ]
+                around = borders(lift >= level, 0.1 * number, (0.0, 0.0), sides)
+                lines = [(one[:2], one[2:]) for one in around]
                 drawn = rr.LineStrips2D(lines, colors=[color], radii=rr.Radius.ui_points(_WIDE))
-                recording.log(["pictures", camera, f"{level:g} times even"], drawn, step)
+                recording.log([*place, f"{level:g} times even"], drawn, step)
 
 
 def _log_words(
@@ -291,36 +292,46 @@ def _log_actions(recording: _Recording, shown: ShownEpisode, about: Mapping[str,
     recording.series(["actions"], steps, curves)
 
 
-def _blueprint(about: Mapping[str, Any], sites: Sequence[str], effects: bool) -> Any:
-    """Pictures, words and scene on the left, numbers over time on the right."""
+def _blueprint(rr: Any, about: Mapping[str, Any], kinds: Collection[str]) -> Any:
+    """Pictures, words and scene on the left, numbers over time on the right; kinds: of items with an effect."""
     import rerun.blueprint as rrb
 
-    cameras = dict.fromkeys(camera for site in about["sites"].values() for camera in site["cameras"])
+    sites = {site: [site] if len(about["sites"]) > 1 else [] for site in about["sites"]}
     spelled = [site for site in sites if any(prompt["words"] for prompt in about["sites"][site]["prompts"])]
-    before = {site: f"/{site}" if len(sites) > 1 else "" for site in sites}
-    left = [
-        rrb.Horizontal(*[rrb.Spatial2DView(origin=f"/pictures/{camera}", name=camera) for camera in cameras]),
-        rrb.Horizontal(
-            rrb.Vertical(
-                rrb.TextDocumentView(origin="/about", name="episode"),
-                *[rrb.TextDocumentView(origin=f"{before[site]}/words", name="words") for site in spelled],
-            ),
-            *([rrb.Spatial3DView(origin="/scene", name="scene (m)")] if about["courses"] else []),
-        ),
-        rrb.TextLogView(origin="/events", name="events"),
+
+    def place(site: str, *parts: str, name: str) -> dict[str, str]:
+        return {"origin": _path(rr, [*sites[site], *parts]), "name": f"{name} ({site})" if sites[site] else name}
+
+    pictures = [
+        rrb.Spatial2DView(**place(site, "pictures", camera, name=camera))
+        for site in sites
+        for camera in about["sites"][site]["cameras"]
     ]
-    plots: list[tuple[str, str, Sequence[str]]]
-    plots = [(f"{before[site]}/ratio", "ratio, and if spread evenly", ()) for site in sites]
-    plots += [(f"{before[site]}/masses", "attention on groups", ()) for site in sites]
-    plots += [(f"{before[site]}/attention", "words: times even attention", ()) for site in spelled]
-    if effects:
-        plots.append(("/effects", "how far the action moves without a word", ("/effects/word/**", "/effects/noise/**")))
+    texts = [
+        rrb.TextDocumentView(origin="/about", name="episode"),
+        *[rrb.TextDocumentView(**place(site, "words", name="words")) for site in spelled],
+    ]
+    scene = [rrb.Spatial3DView(origin="/scene", name="scene (m)")] if about["courses"] else []
+    left = [rrb.Horizontal(*pictures)] * bool(pictures)
+    left += [rrb.Horizontal(rrb.Vertical(*texts), *scene), rrb.TextLogView(origin="/events", name="events")]
+    plots = [
+        *[rrb.TimeSeriesView(**place(site, "ratio", name="ratio, and if spread evenly")) for site in sites],
+        *[rrb.TimeSeriesView(**place(site, "masses", name="attention on groups")) for site in sites],
+        *[rrb.TimeSeriesView(**place(site, "attention", name="words: times even attention")) for site in spelled],
+    ]
+    if kinds:
+        of_words = ["/effects/word/**", "/effects/noise/**"] if "word" in kinds else "$origin/**"
+        name = "how far the action moves without a word" if "word" in kinds else "how far the action moves"
+        plots.append(rrb.TimeSeriesView(origin="/effects", contents=of_words, name=name))
     if about["courses"] or about["actions"]:
-        plots.append(("/actions", "actions", ()))
-    right = rrb.Vertical(
-        *[rrb.TimeSeriesView(origin=at, contents=of or "$origin/**", name=name) for at, name, of in plots]
+        plots.append(rrb.TimeSeriesView(origin="/actions", name="actions"))
+    whole = rrb.Horizontal(
+        rrb.Vertical(*left, row_shares=[3, 4, 2][-len(left) :]), rrb.Vertical(*plots), column_shares=[3, 2]
     )
-    closed = [panel(state="collapsed") for panel in (rrb.BlueprintPanel, rrb.SelectionPanel, rrb.TimePanel)]
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(*left, row_shares=[3, 4, 2]), right, column_shares=[3, 2]), *closed
+        whole, *[panel(state="collapsed") for panel in (rrb.BlueprintPanel, rrb.SelectionPanel, rrb.TimePanel)]
     )
+
+
+def _path(rr: Any, parts: Sequence[str]) -> str:
+    return "/".join(rr.escape_entity_path_part(part) for part in parts)

@@ -119,10 +119,10 @@ def test_one_episode_is_one_file(store, tmp_path, capsys):
     assert main(["view", str(store), "--file", str(path), "--task", "7"]) == 2
     assert "it has task000_episode000" in capsys.readouterr().err
     no, other = ["--file", str(tmp_path / "no.html")], write_store(tmp_path / "b.zarr", spec=SPEC)
-    for wrong in ([*no, "--site", str(tmp_path / "site")], [str(other), *no]):
+    rrd, site = ["--rrd", str(tmp_path / "rrd")], ["--site", str(tmp_path / "site")]
+    for wrong in ([*no, *site], [str(other), *no], ["--task", "0"], [*rrd, "--heads"], [*site, "--episode", "0"]):
         assert main(["view", str(store), *wrong]) == 2
-    assert not (tmp_path / "no.html").exists()
-    assert not (tmp_path / "site").exists()
+    assert not any((tmp_path / name).exists() for name in ("no.html", "site", "rrd"))
 
 
 @pytest.mark.parametrize("place", ["a.zarr", "file", "full", "hub/datasets"])
