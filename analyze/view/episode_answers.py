@@ -103,14 +103,14 @@ class ShownEpisode:
                 for thing in attributes.objects
                 if thing.kind == "object"
             ],
-            "events": self._events(starts, line["outcome"]),
+            "events": self._events(starts, end, line["outcome"]),
             "courses": self._courses(),
             "actions": _numbers(self.episode.read("actions")) if self.episode.has("actions") else None,
             "effects": attributes.effects is not None,
             "sites": {site.name: self._site(site.name) for site in self.store.attributes.sites},
         }
 
-    def _events(self, starts: NDArray[np.int64], outcome: bool | None) -> list[dict[str, Any]]:
+    def _events(self, starts: NDArray[np.int64], end: int, outcome: bool | None) -> list[dict[str, Any]]:
         """Touches, reached goals and closings of the gripper, in the order of their steps; then the end."""
         attributes = self.episode.attributes
         found: list[tuple[int, str, str, str]] = []
@@ -126,7 +126,7 @@ class ShownEpisode:
             executed = self.episode.read(EXECUTED)
             found += [(at, "gripper", "gripper closes", "") for at in _closings(executed[:, GRIPPER])]
         ends = {True: "solved", False: "not solved", None: "end"}[outcome]
-        found = [*sorted(found), (attributes.num_steps, "end", ends, "")]
+        found = [*sorted(found), (end, "end", ends, "")]
         replans = np.searchsorted(starts, [max(at - 1, 0) for at, *_ in found], side="right") - 1
         return [
             {"step": at, "replan": int(replan), "kind": kind, "text": visible(text), "thing": thing}

@@ -21,13 +21,14 @@ import vla_attention as va
 from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
 from tests.kit.bowl_scene import bowl_tokens
 from tests.kit.golden_stores import golden_store
+from tests.kit.site_stores import write_site_store
 from tests.kit.stores import StoreSpec, small_steps, write_store
 from tests.kit.viewer import ask, served
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, stored_picture, upright
 from vla_attention.analyze.measures.question import ask as question_of
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.view.answers import Answers
-from vla_attention.analyze.view.episode_answers import MEAN, _closings
+from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, _closings
 from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
@@ -285,3 +286,11 @@ def test_the_run_says_what_the_commands_find(places):
     said = {finding["sentence"] for finding in given["findings"]}
     assert {one.sentence for one in va.open(places["steps"]).failures().findings} <= said
     assert all(math.isfinite(row["ratio"]) for row in given["episodes"])
+
+
+def test_an_episode_of_unknown_length_ends_behind_its_last_call(tmp_path):
+    store = open_store(write_site_store(tmp_path / "a.zarr", episodes=1))
+    about = ShownEpisode(store, store.episodes[0]).about()
+    (end,) = about["events"]
+    assert (end["kind"], end["replan"]) == ("end", len(about["starts"]) - 1)
+    assert end["step"] == about["end"] > about["starts"][-1]
