@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -27,7 +27,7 @@ from vla_attention.capture.torch_policies.policy_weights import device_and_dtype
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.repeated_calls import effects_of_layout
 from vla_attention.capture.torch_policies.session import RecordedRun
-from vla_attention.schemas.errors import BadArgument, Note, listing
+from vla_attention.schemas.errors import BadArgument, Note, listing, unknown_name
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout
@@ -60,6 +60,7 @@ def record(
     bits: int = 10,
     contributions: bool = True,
     frames: bool = True,
+    mirrored: Collection[str] = (),
     effects: str | EffectSettings | None = None,
     interventions: Interventions | None = None,
     allow_empty: bool = False,
@@ -97,6 +98,8 @@ def record(
         contributions: also what each part of the keys adds to the residual stream, gates and norms included
             (docs/my-policy.md, "Contributions"). It is an error at a policy call that does not show it.
         frames: store the pictures that replans are given.
+        mirrored: cameras whose pictures have left and right exchanged, as those of LIBERO that are turned by 180
+            degrees: they are stored as the policy gets them, and shown as a person sees the scene.
         effects: what is taken away from each call, one at a time, to see how the action changes: `text`, `cameras`,
             `objects`, `tokens`, with commas between, or `EffectSettings`. Each replan then needs `repeat`
             (docs/my-policy.md, "Effects").
@@ -148,6 +151,9 @@ def record(
     if planned is not None:
         refuse_both(changes)
         recording = replace(recording, effects=planned)
+    for camera in mirrored:
+        if camera not in layout.camera_names:
+            raise unknown_name("camera", camera, layout.camera_names)
     device, dtype = device_and_dtype(policy)
     facts = describe_machine(device)
     facts |= {library: version for library, version in installed.items() if version is not None}
@@ -166,7 +172,7 @@ def record(
         )
     facts |= dict(provenance or {})
     attributes = root_attributes(
-        _identity(policy, layout, checkpoint, digest, dtype, untrained=untrained),
+        _identity(policy, layout, checkpoint, digest, dtype, mirrored, untrained=untrained),
         recorded_sites(layout, recording),
         Protocol(suite=suite, seed=0, wait_steps=0, replan_steps=0, max_steps=0, name="recorded", image_size=0),
         recording,
@@ -203,10 +209,17 @@ def recorded_sites(layout: PolicyLayout, recording: Recording) -> tuple[SiteLayo
 
 
 def _identity(
-    policy: object, layout: PolicyLayout, checkpoint: str, digest: str, dtype: str, *, untrained: bool
+    policy: object,
+    layout: PolicyLayout,
+    checkpoint: str,
+    digest: str,
+    dtype: str,
+    mirrored: Collection[str],
+    *,
+    untrained: bool,
 ) -> PolicyIdentity:
-    # Pictures are shown as the policy gets them: row 0 on top.
-    views = tuple(PolicyCameraView(name, name, upright=True, mirrored=False) for name in layout.camera_names)
+    # Row 0 of what the policy gets is on top.
+    views = tuple(PolicyCameraView(name, name, upright=True, mirrored=name in mirrored) for name in layout.camera_names)
     return PolicyIdentity(
         name=layout.name,
         family=layout.family,

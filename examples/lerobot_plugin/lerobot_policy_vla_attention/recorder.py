@@ -57,6 +57,11 @@ def pictures_of(observation: dict[str, Any], preprocessor: Any, row: int) -> dic
     }
 
 
+def turns_pictures(env_preprocessor: Any) -> bool:
+    """Return whether left and right are exchanged: LeRobot turns LIBERO's pictures, upside down, by 180 degrees."""
+    return any(type(step).__name__ == "LiberoProcessorStep" for step in getattr(env_preprocessor, "steps", ()))
+
+
 def instructions_of(env: Any) -> list[str]:
     """Return each environment's instruction, from where lerobot-eval has it."""
     for name in ("task_description", "task"):
@@ -96,7 +101,9 @@ class Recorder:
         preprocessor, observed = arguments.pop("preprocessor"), {}
         if self.run is None:
             tokenizer = tokenizer_of(preprocessor, policy)
-            settings = {"layout": layout_of(policy), "tokenizer": tokenizer, **self.settings}
+            layout = layout_of(policy)
+            turned = layout.camera_names if turns_pictures(arguments.get("env_preprocessor")) else ()
+            settings = {"layout": layout, "tokenizer": tokenizer, "mirrored": turned, **self.settings}
             self.run = va.record(self.store, policy, **settings).__enter__()
         first, self.episodes = self.episodes, self.episodes + env.num_envs
         facts = [

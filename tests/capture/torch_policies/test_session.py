@@ -21,6 +21,9 @@ from tests.kit.small_torch_policy import (
     given,
     small_layout,
 )
+from vla_attention.analyze.core.camera_maps import stored_picture
+from vla_attention.analyze.measures.question import ask
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
@@ -163,7 +166,7 @@ def test_contributions_are_those_of_the_values_and_the_projection(tmp_path, poli
 
 
 def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
-    with start(tmp_path, policy, suite="my_robot", checkpoint="mine", untrained=True) as run:
+    with start(tmp_path, policy, suite="my_robot", checkpoint="mine", untrained=True, mirrored=["front"]) as run:
         fill(run, policy, task_name="bowl", task_family="pick A")
     store = stored(tmp_path)
     episode = store.episodes[0]
@@ -182,6 +185,9 @@ def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
     np.testing.assert_allclose(episode.read("state")[1], given(seed=1)["states"][0].numpy())
     picture = (given(seed=1)["pictures"][0].permute(1, 2, 0) * 255).round().byte().numpy()
     np.testing.assert_array_equal(episode.read("frames/front")[1], picture)
+    # Stored as given, and shown with left on the left.
+    item = ask([store], AnalysisSettings()).selected[0]
+    np.testing.assert_array_equal(stored_picture(item, "front", 1), picture[:, ::-1])
     root = store.attributes
     assert (root.protocol.name, root.protocol.suite) == ("recorded", "my_robot")
     assert root.policy.untrained
@@ -279,6 +285,7 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
+        ({"mirrored": ["wrist"]}, UnknownName, "Unknown camera 'wrist'"),
         ({"heads": [2]}, BadArgument, "There is no head 2; expected 0 to 1"),
         ({"resume": True, "overwrite": True}, BadArgument, "not both"),
         ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, "written for torch 1.0"),
