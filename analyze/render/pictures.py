@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 _COLUMNS = 8
 #: Inches of a picture's side, at least and at most; between pictures; of a line of text; of title, words and legend.
 _LEAST, _LARGEST, _GAP, _LINE, _BAND = 1.25, 2.4, 0.07, 0.13, 0.28
+#: Inches between words of the instruction, and of one of their letters.
+_WORD_GAP, _LETTER = 0.13, 0.083
 #: Letters of the text at a picture, in an inch.
 _LETTERS = 20
 #: Surroundings: part of the picture that is kept, of that the part in colour, and the grey that the rest is.
@@ -99,16 +101,17 @@ def pictures(figure: Figure, style: Style) -> Canvas:
     above, below = heights_of.values()
     high = sum(heights.values()) + len(rows) * (above + below + 0.14)
     top = 0.06 if style.paper else _BAND
-    words, has_map = _words(frame), any(values is not None for *_, values in shown)
-    start = top + _BAND * bool(words)
-    width = max(margin + across * (side + _GAP), 3.3)
+    width, has_map = max(margin + across * (side + _GAP), 3.3), any(values is not None for *_, values in shown)
+    said = _lines(_words(frame), width)
+    start = top + _BAND * len(said)
     height = start + high * -(-len(columns) // _COLUMNS) + (_BAND if has_map else 0.0)
     canvas = style.canvas(width, height)
     axes = canvas.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     axes.set_axis_off()
     if not style.paper:
         axes.text(0.08, 0.07, wrapped(figure.title, int(13 * width), 1), va="top", size=10)
-    _draw_words(axes, words, float(o.get("words_high", 4.0)), top + _BAND / 2)
+    for number, of_line in enumerate(said):
+        _draw_words(axes, of_line, float(o.get("words_high", 4.0)), top + _BAND * (number + 0.5))
     levels = list(o.get("levels", ()))
     looks = [("black", points, f"{level:g} times even or more") for level, points in zip(levels, _LINES, strict=False)]
     looks += [
@@ -195,6 +198,19 @@ def _words(frame: pl.DataFrame) -> list[tuple[str, float]]:
         return []
     lifts = np.array(frame["lifts"].to_list(), dtype=np.float64)
     return list(zip(frame["words"][0].to_list(), np.nanmean(lifts, axis=0).tolist(), strict=True))
+
+
+def _lines(words: Sequence[tuple[str, float]], width: float) -> list[list[tuple[str, float]]]:
+    """The words in as many lines as a picture of so many inches needs."""
+    lines: list[list[tuple[str, float]]] = []
+    room = 0.0
+    for word in words:
+        room -= _WORD_GAP + _LETTER * len(word[0])
+        if room < 0.0 or not lines:
+            lines.append([])
+            room = width - 0.12 - _WORD_GAP - _LETTER * len(word[0])
+        lines[-1].append(word)
+    return lines
 
 
 def _draw_words(axes: Axes, words: Sequence[tuple[str, float]], high: float, down: float) -> None:
