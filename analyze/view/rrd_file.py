@@ -42,7 +42,7 @@ from vla_attention.analyze.render.style import group_styles
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
-from vla_attention.schemas.errors import MissingDependency, plural
+from vla_attention.schemas.errors import BadArgument, MissingDependency, plural
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -145,10 +145,14 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None)
     """Write one episode."""
     about = shown.about()
     stream = rr.RecordingStream("vla-attention", recording_id=f"{shown.store.run} {shown.episode.name}")
+    if not rr.is_enabled(stream):
+        raise BadArgument("Rerun is switched off by the environment variable RERUN; unset it.")
     sites = [site.name for site in shown.store.attributes.sites]
     effects = [] if units is None else _effects(shown, units)
     kinds = dict.fromkeys(item["item_kind"] for item in effects)
-    stream.save(str(path), default_blueprint=_blueprint(rr, about, kinds))
+    # Of a file of its own Rerun says in its log alone that the disk was full.
+    memory = stream.memory_recording()
+    stream.send_blueprint(_blueprint(rr, about, kinds), make_active=False)
     recording = _Recording(rr, stream)
     stream.send_recording_name(f"{shown.store.suite}: {about['told'] or about['instruction']} ({shown.episode.name})")
     recording.log(["about"], rr.TextDocument(_about(shown, about), media_type=rr.MediaType.MARKDOWN))
@@ -166,6 +170,7 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None)
     _log_actions(recording, shown, about)
     for event in about["events"]:
         recording.log(["events"], rr.TextLog(event["text"]), event["step"])
+    path.write_bytes(memory.drain_as_bytes())
     stream.disconnect()
 
 
@@ -223,7 +228,7 @@ def _log_words(
 ) -> None:
     """Every word's attention, as a series and in a table beside its effect; a word that comes twice has a number."""
     rr = recording.rr
-    effect_of = {item["item"]: item["effect"] for item in effects if item["item_kind"] == "word"}
+    effect_of = {item["item"].casefold(): item["effect"] for item in effects if item["item_kind"] == "word"}
     curves: dict[str, list[float | None]] = {}
     for replan, words in enumerate(maps.words):
         lines, seen = ["| word | times even | effect |", "|---|---:|---:|"], Counter[str]()
@@ -232,7 +237,8 @@ def _log_words(
             seen[text] += 1
             name = text if seen[text] == 1 else f"{text} ({seen[text]})"
             curves.setdefault(name, [None] * len(starts))[replan] = lift
-            effect = effect_of[f"'{text}'"][replan] if f"'{text}'" in effect_of else None
+            tried = effect_of.get(f"'{text.casefold()}'")  # effects name words in lower case
+            effect = None if tried is None else tried[replan]
             lines.append(f"| {text} | {lift:.2f} | {'' if effect is None else f'{effect:.2f}'} |")
         table = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
         recording.log([*before, "words"], table, starts[replan])

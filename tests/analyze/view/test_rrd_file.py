@@ -20,6 +20,7 @@ from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import write_site_store
 from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.view import rrd_file
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 
 SPEC = StoreSpec(tasks=(0, 1), replans=3, plant_effects=planted_effects(), plant_steps=small_steps)
@@ -124,6 +125,22 @@ def test_words_have_what_their_keys_get_over_even_attention(store, recording, st
         shown = {word: values[step] for word, values in curves(recording, "attention").items() if step in values}
         assert sorted(shown.values()) == pytest.approx(sorted(row["lifts"]))
     assert frame.height
+
+
+def test_a_word_with_a_capital_letter_has_its_effect():
+    texts: list[str] = []
+    rr = SimpleNamespace(TextDocument=lambda text, **_: text, MediaType=SimpleNamespace(MARKDOWN=""))
+    recording = SimpleNamespace(rr=rr, log=lambda _, text, __: texts.append(text), series=lambda *_: None)
+    effects = [{"item": "'lift'", "item_kind": "word", "effect": [0.5]}]
+    rrd_file._log_words(recording, [], SimpleNamespace(words=[[("Lift", 2.0)]]), effects, [0])  # type: ignore[arg-type]
+    assert texts[0].splitlines()[2:] == ["| Lift | 2.00 | 0.50 |"]
+
+
+def test_a_full_disk_ends_it_and_leaves_nothing(tmp_path, store, rerun):
+    view = [sys.executable, "-m", "vla_attention", "view", str(store), "--rrd", str(tmp_path / "a.rrd")]
+    done = subprocess.run(["sh", "-c", 'ulimit -f 64; exec "$@"', "sh", *view], capture_output=True, text=True)
+    assert (done.returncode, "Cannot write recordings to" in done.stderr) == (2, True)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_pictures_are_the_stored_ones_and_lines_go_around_what_gets_twice_even(store, episode, recording, starts):
