@@ -151,6 +151,7 @@ def record(
     if planned is not None:
         refuse_both(changes)
         recording = replace(recording, effects=planned)
+    mirrored = (mirrored,) if isinstance(mirrored, str) else tuple(mirrored)
     for camera in mirrored:
         if camera not in layout.camera_names:
             raise unknown_name("camera", camera, layout.camera_names)

@@ -166,7 +166,7 @@ def test_contributions_are_those_of_the_values_and_the_projection(tmp_path, poli
 
 
 def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
-    with start(tmp_path, policy, suite="my_robot", checkpoint="mine", untrained=True, mirrored=["front"]) as run:
+    with start(tmp_path, policy, suite="my_robot", checkpoint="mine", untrained=True, mirrored="front") as run:
         fill(run, policy, task_name="bowl", task_family="pick A")
     store = stored(tmp_path)
     episode = store.episodes[0]
@@ -277,6 +277,8 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
         pass
     other = small_layout(rules=(*small_layout().rules, CallRule("vision.*", None)))
     with pytest.raises(RunMismatch, match="layout"), start(tmp_path, policy, resume=True, layout=other):
+        pass
+    with pytest.raises(RunMismatch, match="camera"), start(tmp_path, policy, resume=True, mirrored=["front"]):
         pass
     with start(tmp_path, policy, overwrite=True, bits=12) as run:
         assert not run.has(0, 0)
