@@ -25,7 +25,7 @@ from vla_attention.schemas.safe_text import visible
 _EPISODE = ["suite", "task_id", "episode_index"]
 _OUTCOME = ("suite", "task_id", "instruction", "solved", "num_steps")
 #: Columns that only `behaviour` and joins need.
-_KEYS = ("goals", "scene", "state", "told_goal", "own_goal", "scene_goal", "twin_index", "twin_replan")
+_KEYS = ("goals", "scene", "state", "as_told", "told_goal", "own_goal", "scene_goal", "twin_index", "twin_replan")
 _WHY = "Why did it fail?"
 _UNKNOWN = "An episode is solved or failed where a simulator or the recording code says so; a replay runs nothing."
 _WHERE = "Where did it leave the solved ones?"

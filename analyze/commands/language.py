@@ -136,7 +136,7 @@ def listens(asked: pl.DataFrame) -> Finding:
     rest = [*asked.drop_nulls("left_out")["left_out"].value_counts(sort=True).sort("left_out").iter_rows()]
     left = [f"{plural(count, 'episode')} left out: {why}." for why, count in rest]
     if shown.is_empty():
-        done = asked.filter(pl.col("did") == pl.col("told")).height
+        done = asked.filter("as_told").height
         whys = "; ".join(f"in {count} of {plural(n, 'episode')}, {why}" for why, count in rest)
         return Finding(
             f"These episodes cannot show whether it listens: {whys}. It did what it was told in {done} of {n}.",
@@ -192,7 +192,7 @@ def _behaviour_tables(asked: pl.DataFrame) -> list[Table]:
     matrix = matrix.sort("told", "episodes", "did", descending=[False, True, False])
     result = pl.col("outcome").replace_strict({True: "solved", False: "failed"}, default="not known")
     rows = asked.with_columns(outcome=result).drop(
-        "goals", "scene", "stratum", "state", "own_goal", "told_goal", "first", "scene_goal"
+        "goals", "scene", "stratum", "state", "own_goal", "told_goal", "as_told", "first", "scene_goal"
     )
     return [
         Table("told_and_did", matrix, _MATRIX, "Told and did", rows=20),

@@ -28,7 +28,7 @@ SCHEMA: dict[str, Any] = {
     **dict.fromkeys(("scene_instruction", "scene_goal"), pl.String),
     **dict.fromkeys(("task_id", "episode_index", "num_steps", "touched_at", "did_at", "scene_task_id"), pl.Int64),
     "outcome": pl.Boolean,
-    "followed": pl.Boolean,
+    **dict.fromkeys(("as_told", "followed"), pl.Boolean),
     "goals": pl.List(pl.Struct({"goal": pl.String, "instruction": pl.String, "held": pl.Int64})),
 }
 OTHER_GOAL, OTHER_TOUCH, NO_TOUCH = "reached another goal", "touched something else first", "touched nothing"
@@ -55,6 +55,7 @@ def behaviour(episodes: Iterable[tuple[Store, StoredEpisode]]) -> pl.DataFrame:
         outcome, num_steps         success (null: not known) and executed actions
         touched, touched_at        the body that the gripper touched first, and the step; null: none
         did, did_at                instruction of the goal that it reached, see `_done`, and the step; null: none
+        as_told                    whether that is the told goal, whichever words name it
         how                        what it did, if its task was not solved: a sentence without its subject
         before                     a goal like the told one that held before the told one was reached; null: none
         goals                      of the scene: goal, instruction, held (step at which it first held; null: never)
@@ -114,6 +115,7 @@ def row_of(
         "touched_at": touched_at,
         "did": None if done is None else visible(done.instruction),
         "did_at": None if done is None else done.first_held,
+        "as_told": told_so,
         "how": None if attributes.success else how,
         "before": None if before is None else visible(before.instruction),
         "scene_task_id": attributes.scene_task_id,

@@ -37,8 +37,8 @@ def exchanged(asked: pl.DataFrame, sampling: Sampling) -> tuple[list[Finding], l
         return [], [], []
     rows = rows.with_columns(
         sentence=pl.when(pl.col("told_goal") == pl.col("scene_goal")).then(pl.lit(OWN)).otherwise(pl.lit(EXCHANGED)),
-        did_told=pl.col("did") == pl.col("told"),
-        did_scene=(pl.col("did") == pl.col("scene_instruction")) & (pl.col("did") != pl.col("told")),
+        did_told="as_told",
+        did_scene=(pl.col("did") == pl.col("scene_instruction")) & ~pl.col("as_told"),
         counted=pl.col("left_out").is_null() | (pl.col("left_out") == ALONE),
     ).with_columns(pl.col("did_told", "did_scene").fill_null(False))
     # An own sentence has no other one that could have been done instead.

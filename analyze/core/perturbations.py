@@ -43,8 +43,7 @@ def by_suite(rows: pl.DataFrame, asked: pl.DataFrame) -> pl.DataFrame:
             the task names over what its area gives it; null where that is not known.
         asked: of `behaviour`: what was told and done.
     """
-    as_told = pl.col("did").eq_missing(pl.col("told")).cast(pl.Float64)
-    did = asked.select("suite", "task_id", "episode_index", did=as_told)
+    did = asked.select("suite", "task_id", "episode_index", did=pl.col("as_told").cast(pl.Float64))
     rows = rows.join(did, on=("suite", "task_id", "episode_index"), how="left")
     means = [pl.mean("solved", "did", "named")]
     tasks = rows.group_by("suite", "task_id").agg(pl.len().alias("num_episodes"), *means)

@@ -22,6 +22,7 @@ from tests.kit.stores import rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.language import language, listens
 from vla_attention.analyze.core.behaviour import with_choices
+from vla_attention.analyze.core.perturbations import by_suite
 from vla_attention.analyze.statistics.exact_tests import mcnemar, shuffled
 from vla_attention.schemas.interventions import Interventions, PromptChange
 
@@ -197,3 +198,11 @@ def test_another_prompt_is_told_first(tmp_path):
         write_store(tmp_path / f"{name}.zarr", **more) for name, more in (("a", {}), ("b", {"interventions": change}))
     )
     assert len(language(question_about(plain)).about) < len(language(question_about(told)).about)
+
+
+def test_other_words_for_the_told_goal_count_as_done():
+    for told, same in (("Touch the RED cube.", False), ("hit the crimson cube", True)):
+        asked = did([(0, {0: 5}), (0, {})], told=told, same=same)
+        rows = asked.select("suite", "task_id", "episode_index", solved=pl.lit(0.5), named=pl.lit(0.0))
+        assert by_suite(rows, asked)["did"].to_list() == [0.5]
+        assert "in 1 of 2" in listens(with_choices(asked)).sentence
