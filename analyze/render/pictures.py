@@ -14,7 +14,7 @@ Columns of the frame, a row for each picture:
 Options: picture, a function of a row of the frame that gives its picture (row, column, 3) uint8, or None where there is
 none; high, the value from which on pictures are as bright as they get (`even` gives 1); levels, the values at which
 lines are drawn, at most two; outlines, names of groups; smooth, whether values change smoothly between patches;
-words_high, as high, of the words.
+words_high, as high, of the words; sentences, for whose words there is room.
 """
 
 from __future__ import annotations
@@ -103,7 +103,8 @@ def pictures(figure: Figure, style: Style) -> Canvas:
     top = 0.06 if style.paper else _BAND
     width, has_map = max(margin + across * (side + _GAP), 3.3), any(values is not None for *_, values in shown)
     said = _lines(_words(frame), width)
-    start = top + _BAND * len(said)
+    others = [_lines([(word, 0.0) for word in words], width) for words in o.get("sentences", ())]
+    start = top + _BAND * max(map(len, [said, *others]))
     height = start + high * -(-len(columns) // _COLUMNS) + (_BAND if has_map else 0.0)
     canvas = style.canvas(width, height)
     axes = canvas.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), autoscale_on=False)
@@ -193,8 +194,11 @@ def _draw_lines(axes: Axes, segments: Sequence[Segment], color: str, points: flo
 
 
 def _words(frame: pl.DataFrame) -> list[tuple[str, float]]:
-    """The words of the instruction with the mean of their values over the shown pictures."""
-    if "words" not in frame.columns or frame["words"].null_count() == frame.height or not len(frame["words"][0]):
+    """The words of the instruction with the mean of their values over the shown pictures; none if these were told
+    different ones.
+    """
+    told = {tuple(words or ()) for words in frame["words"].to_list()} if "words" in frame.columns else {()}
+    if len(told) > 1 or () in told:
         return []
     lifts = np.array(frame["lifts"].to_list(), dtype=np.float64)
     return list(zip(frame["words"][0].to_list(), np.nanmean(lifts, axis=0).tolist(), strict=True))

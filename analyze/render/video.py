@@ -60,6 +60,8 @@ def _film(figure: Figure) -> Iterator[NDArray[np.uint8]]:
     style, frame = Style(), figure.frame.with_columns(pl.col("row").cast(pl.String))
     named = frame["row"].n_unique() > 1
     above = pl.format("{}\n{}", "row", "above") if named else pl.col("above")
+    told = {tuple(words) for words in frame["words"].drop_nulls()} if "words" in frame.columns else ()
+    figure = replace(figure, options={**figure.options, "sentences": told})
     with style.settings():
         for part in frame.partition_by("column", maintain_order=True):
             side_by_side = part.with_columns(row=pl.lit(0), column="row", above=above)

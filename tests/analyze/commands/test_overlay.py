@@ -4,6 +4,7 @@ input.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,10 @@ from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.overlay import overlay
 from vla_attention.analyze.core.camera_maps import choose_episodes
+from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.pictures import lit
+from vla_attention.analyze.render.style import Style
+from vla_attention.analyze.render.video import _film
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
@@ -139,6 +143,17 @@ def test_words_have_their_lifts_and_outlines_their_patches(made: Path) -> None:
     np.testing.assert_allclose(row["lifts"], wanted, rtol=1e-5)
     assert np.argwhere(np.array(row["members"][0])).sum() in (1, 3, 5, 9)  # two neighbours, wherever they are turned
     assert np.array(row["members"][0]).sum() == 2
+
+
+def test_an_instruction_that_changes_is_no_mean_of_two_and_leaves_films_of_one_size(made: Path) -> None:
+    figure = overlay(question_about(made), episode=0).figures[0]
+    told = [["on"], ["lift"], ["put", "the", "bowl", *["very"] * 20, "carefully"]]
+    rows = [(told[min(replan, 2)], [1.0] * len(told[min(replan, 2)])) for replan in figure.frame["replan"]]
+    words, lifts = (pl.Series(name, [row[i] for row in rows]) for i, name in enumerate(("words", "lifts")))
+    changed = dataclasses.replace(figure, frame=figure.frame.with_columns(words, lifts))
+    (axes,) = draw(changed, Style()).axes
+    assert not {"on", "lift", "put"} & {text.get_text() for text in axes.texts}
+    assert len({picture.shape for picture in _film(changed)}) == 1
 
 
 def test_without_frames_the_map_alone_is_drawn_with_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
