@@ -60,7 +60,7 @@ def perturbations(table: pl.DataFrame) -> tuple[Finding, Table]:
         values = [how.format(row[name]) for name, how in _SAID.items() if row[name] is not None]
         run = f" ({row['run']})" if several else ""
         said.append(f"{row['kind']} changed{run}: {', '.join([plural(row['num_episodes'], 'episode'), *values])}")
-    apart = not several or (table["pairs"] == 0).any()
+    apart = table.height > 1 and (not several or (table["pairs"] == 0).any())
     limit = "Not paired, so differences of scenes are in it: each suite has initial states of its own." if apart else ""
     columns = [column for column in _COLUMNS if column.name in table.columns]
     shown = Table("perturbations", table, columns, "By what LIBERO-PRO changed")
