@@ -96,7 +96,6 @@ def main() -> int:
     given = arguments.folder
     with tempfile.TemporaryDirectory(prefix="package_") as temporary:
         folder = Path(temporary) if given is None else given.resolve()
-        folder.mkdir(parents=True, exist_ok=True)
         try:
             check_release(arguments.release)
             wheel = build_packages(folder)
@@ -166,6 +165,7 @@ def build_packages(folder: Path) -> Path:
     source, built = folder / "source", folder / "dist"
     outside = not folder.is_relative_to(ROOT) or folder.is_relative_to(ROOT / "build")
     check(outside, f"{folder} is in the checkout, which is copied there; give a folder outside, or one in build/")
+    folder.mkdir(parents=True, exist_ok=True)
     for old in (source, built):
         shutil.rmtree(old, ignore_errors=True)
     shutil.copytree(ROOT, source, symlinks=True, ignore=LEFT_OUT)

@@ -19,6 +19,7 @@ Where a run has several sites, SITE stands before pictures, words, ratio, masses
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -103,7 +104,7 @@ def write_recordings(path: Path, store: Store, episodes: Sequence[StoredEpisode]
                 print(f"About {about} for {len(episodes)} episodes.", flush=True)
             size += file.stat().st_size
             advance(1)
-    opened = path if path.suffix == SUFFIX else path / f"*{SUFFIX}"
+    opened = shlex.quote(str(path)) + f"/*{SUFFIX}" * (path.suffix != SUFFIX)
     return f"{path}: {plural(len(episodes), 'episode')}, {format_bytes(size)}. Open with: rerun {opened}"
 
 
