@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     for option, of in _OPTIONS_OF.items():
         given = getattr(arguments, option)
         if given is not None and given is not False and not {*of} & {*written}:
-            raise BadArgument(f"--{option} is an option of {' and '.join(of)}; add one of them, or leave it out.")
+            raise BadArgument(f"--{option} goes with {' or '.join(of)} only; leave it out, or write one of these.")
     if len(places) > 1 and written not in ([], ["--site"]):
         raise BadArgument(f"{written[0]} writes episodes of one store, and {len(places)} are given; give one.")
     if arguments.rrd is not None:

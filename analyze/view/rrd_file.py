@@ -10,7 +10,7 @@ Numbers are means over layers, denoise steps and heads, the same as on the page.
     ratio, masses, attention   by replan: the ratio and what even attention gives; mass of groups; times even of words
     effects                    by replan: how the action changes without an item, in its units
     scene                      by step: hand and objects in 3D, in metres
-    actions                    by step: what was executed, a number a dimension
+    actions                    by step: what was executed, a number a dimension; else the actions that were returned
     events                     touches, reached goals, closings of the gripper, the end
 
 Where a run has several sites, SITE stands before pictures, words, ratio, masses and attention.
@@ -126,7 +126,7 @@ class _Recording:
         self.stream.send_columns(_path(self.rr, parts), [self.rr.TimeColumn(TIMELINE, sequence=list(steps))], columns)
 
     def series(self, parts: Sequence[str], steps: Sequence[int], curves: Mapping[str, Sequence[float | None]]) -> None:
-        """Log curves by their names below `parts`, a number a step; null and what is not finite are gaps."""
+        """Log curves by their names below `parts`, a number a step; null and what is not finite are left out."""
         colors = group_styles(list(curves))
         for name, values in curves.items():
             known = [
