@@ -151,9 +151,9 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None)
     sites = [site.name for site in shown.store.attributes.sites]
     effects = [] if units is None else _effects(shown, units)
     kinds = dict.fromkeys(item["item_kind"] for item in effects)
-    # Of a file of its own Rerun says in its log alone that the disk was full.
+    # To a full disk Rerun itself writes half a file, and says so in its log alone. Only an active blueprint is shown.
     memory = stream.memory_recording()
-    stream.send_blueprint(_blueprint(rr, about, kinds), make_active=False)
+    stream.send_blueprint(_blueprint(rr, about, kinds))
     recording = _Recording(rr, stream)
     stream.send_recording_name(f"{shown.store.suite}: {about['told'] or about['instruction']} ({shown.episode.name})")
     recording.log(["about"], rr.TextDocument(_about(shown, about), media_type=rr.MediaType.MARKDOWN))
