@@ -165,6 +165,7 @@ def build_packages(folder: Path) -> Path:
     source, built = folder / "source", folder / "dist"
     outside = not folder.is_relative_to(ROOT) or folder.is_relative_to(ROOT / "build")
     check(outside, f"{folder} is in the checkout, which is copied there; give a folder outside, or one in build/")
+    check(not folder.is_file(), f"{folder} is a file; give a folder")
     folder.mkdir(parents=True, exist_ok=True)
     for old in (source, built):
         shutil.rmtree(old, ignore_errors=True)

@@ -30,8 +30,14 @@ The page is served to this machine only, to whoever has the printed link, until 
 place. With the same stores and the same --port the link stays the same.
 """
 
-#: Options that say what is written, and with which of those that write they go.
-_OPTIONS_OF = {"task": ("--file", "--rrd"), "episode": ("--file", "--rrd"), "heads": ("--file", "--site")}
+#: Options, and with what they go: what is written, or the page that is served.
+_SERVED = "a page that is served"
+_OPTIONS_OF = {
+    "--task": ("--file", "--rrd"),
+    "--episode": ("--file", "--rrd"),
+    "--heads": ("--file", "--site"),
+    **dict.fromkeys(("--port", "--allow-host", "--no-open"), (_SERVED,)),
+}
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -45,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
     )
     parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
-    parser.add_argument("--port", type=int, default=0, metavar="N", help="port of the page (default: any free one)")
+    parser.add_argument("--port", type=int, metavar="N", help="port of the page (default: any free one)")
     parser.add_argument(
         "--allow-host",
         action="append",
@@ -86,10 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
     written = [name for name in ("--file", "--rrd", "--site") if getattr(arguments, name.strip("-")) is not None]
     if len(written) > 1:
         raise BadArgument(f"{' and '.join(written)} are two things to write; give one of them.")
+    what = written[0] if written else _SERVED
     for option, of in _OPTIONS_OF.items():
-        given = getattr(arguments, option)
-        if given is not None and given is not False and not {*of} & {*written}:
-            raise BadArgument(f"--{option} goes with {' or '.join(of)} only; leave it out, or write one of these.")
+        given = getattr(arguments, option.strip("-").replace("-", "_"))
+        if what not in of and not (given is None or given is False or given == []):
+            raise BadArgument(f"{option} goes with {' or '.join(of)}, and not with {what}; leave one of them out.")
     if len(places) > 1 and written not in ([], ["--site"]):
         raise BadArgument(f"{written[0]} writes episodes of one store, and {len(places)} are given; give one.")
     if arguments.rrd is not None:
@@ -169,7 +176,7 @@ def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     from vla_attention.analyze.render.browser import open_in_browser
     from vla_attention.analyze.view.server import ViewerServer
 
-    with ViewerServer(stores, arguments.port, allow_hosts=arguments.allow_host, keep_link=True) as server:
+    with ViewerServer(stores, arguments.port or 0, allow_hosts=arguments.allow_host, keep_link=True) as server:
         again = f"; with --port {server.port} its link stays the same" if server.keeps_link else ""
         # At once, also into a file that somebody follows.
         for line in _notes([store.store for store in stores]):

@@ -47,6 +47,7 @@ from vla_attention.schemas.errors import BadArgument, MissingDependency, plural
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 
 if TYPE_CHECKING:
     import rerun
@@ -91,6 +92,8 @@ def write_recordings(path: Path, store: Store, episodes: Sequence[StoredEpisode]
 
     path: a file NAME.rrd for one episode, or a folder that gets a file an episode.
     """
+    if path.suffix == STORE_SUFFIX:
+        raise BadArgument(f"Cannot write recordings to {path}: it is named like a store; give NAME.rrd or a folder.")
     rr = rerun_library()
     units = units_of_recorded(store) if any(one.attributes.effects for one in store.episodes) else None
     size = 0

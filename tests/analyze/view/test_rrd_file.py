@@ -35,6 +35,8 @@ def test_a_library_that_is_missing_or_too_old_is_named(tmp_path, capsys, monkeyp
         assert "pip install 'vla-attention[rerun]'" in said
         assert ("0.23.4" in said) == (library is not None)
     assert not (tmp_path / "a.rrd").exists()
+    assert main(["view", str(store), "--rrd", str(tmp_path / "b.zarr")]) == 2
+    assert "named like a store" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

@@ -120,7 +120,10 @@ def test_one_episode_is_one_file(store, tmp_path, capsys):
     assert "it has task000_episode000" in capsys.readouterr().err
     no, other = ["--file", str(tmp_path / "no.html")], write_store(tmp_path / "b.zarr", spec=SPEC)
     rrd, site = ["--rrd", str(tmp_path / "rrd")], ["--site", str(tmp_path / "site")]
-    for wrong in ([*no, *site], [str(other), *no], ["--task", "0"], [*rrd, "--heads"], [*site, "--episode", "0"]):
+    for wrong in (
+        *([*no, *site], [str(other), *no], ["--task", "0"], [*rrd, "--heads"], [*site, "--episode", "0"]),
+        *([*no, "--port", "8765"], [*site, "--allow-host", "hub.example.org"], [*rrd, "--no-open"]),
+    ):
         assert main(["view", str(store), *wrong]) == 2
     assert not any((tmp_path / name).exists() for name in ("no.html", "site", "rrd"))
 
