@@ -9,10 +9,9 @@ import polars as pl
 
 from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.compared import KINDS, Compared, RunValues, side_by_side, strip_of_pair
-from vla_attention.analyze.core.object_shares import CLASSES
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.safe_text import visible
 
@@ -66,15 +65,7 @@ def perturbed(
         return [], []
     found = []
     for one, pairs in every:
-        no_objects = one.episodes.select(*EPISODE_ID, kind=None, item=None, value=pl.lit(None, pl.Float64))
-        named = one.values.get("objects", no_objects).filter(kind="class", item=CLASSES[0])
-        rows = one.episodes.select(EPISODE_ID)
-        for values in (
-            one.values["groups"].filter(quantity="success").unique(EPISODE_ID).select(*EPISODE_ID, solved="value"),
-            named.select(*EPISODE_ID, named="value"),
-        ):
-            rows = rows.join(values, on=EPISODE_ID, how="left")
-        suites = by_suite(rows, told[one.run.name])
+        suites = by_suite(one.run.question, told[one.run.name], one.values.get("objects"))
         num_pairs = [None if pairs is None else pairs.filter(suite=suite).height for suite in suites["suite"]]
         run, of_pairs = pl.lit(one.run.name).alias("run"), pl.Series("pairs", num_pairs, pl.Int64)
         found.append(suites.select(run, pl.all()).with_columns(of_pairs))

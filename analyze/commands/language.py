@@ -16,17 +16,9 @@ from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.exchanged import exchanged
-from vla_attention.analyze.core.object_shares import (
-    ALL_CAMERAS,
-    CLASSES,
-    cameras_of,
-    measure_objects,
-    object_episodes,
-    with_coverage,
-)
+from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.exact_tests import shuffled
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
@@ -84,14 +76,7 @@ def _perturbed(question: Question, asked: pl.DataFrame) -> tuple[list[Finding], 
     """By what LIBERO-PRO changed: success, doing what was told, attention to what the task names; none without it."""
     if not any_perturbed(store.suite for store in question.stores):
         return [], []
-    schema = {**dict(zip(EPISODE_ID, (pl.String, pl.Int64, pl.Int64), strict=True)), "solved": pl.Float64}
-    rows = pl.DataFrame([(*one.key, one.episode.attributes.success) for one in question.selected], schema, orient="row")
-    named = pl.DataFrame(schema=schema).rename({"solved": "named"})
-    if any(cameras_of(item) for item in question.selected):
-        objects = object_episodes(measure_objects(with_coverage(question)))
-        objects = objects.filter(camera=ALL_CAMERAS, layer=LAYERS_AVG, kind="class", item=CLASSES[0])
-        named = objects.select(*EPISODE_ID, named=pl.col("enrichment").log(2.0)).collect()
-    finding, table = perturbations(by_suite(rows.join(named, on=EPISODE_ID, how="left"), asked))
+    finding, table = perturbations(by_suite(question, asked, object_values(question)))
     return [finding], [table]
 
 

@@ -21,13 +21,7 @@ from vla_attention.analyze.core.courses import strip
 from vla_attention.analyze.core.estimate import Scale, estimate, with_q
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
 from vla_attention.analyze.core.measure import measure, table_of
-from vla_attention.analyze.core.object_shares import (
-    ALL_CAMERAS,
-    cameras_of,
-    measure_objects,
-    object_episodes,
-    with_coverage,
-)
+from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
@@ -80,12 +74,8 @@ class RunValues:
         if self.run.question.vocabulary.words:
             words = table_of(measure(self.run.question, items_of)).filter(pl.col("kind") == "word")
             tables["words"] = words.select(*EPISODE_ID, "item", value=pl.col("lift").log(2.0)).collect()
-        if any(cameras_of(item) for item in self.run.question.selected):
-            objects = object_episodes(measure_objects(with_coverage(self.run.question)))
-            objects = objects.filter(camera=ALL_CAMERAS, layer=LAYERS_AVG)
-            tables["objects"] = objects.select(
-                *EPISODE_ID, "kind", "item", value=pl.col("enrichment").log(2.0)
-            ).collect()
+        if (objects := object_values(self.run.question)) is not None:
+            tables["objects"] = objects
         return tables
 
     def _heads(self) -> pl.DataFrame:

@@ -7,7 +7,10 @@ from collections.abc import Iterable
 
 import polars as pl
 
+from vla_attention.analyze.core.object_shares import CLASSES
 from vla_attention.analyze.core.result import Column, Finding, Table
+from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.errors import plural
 
 #: What a suite of LIBERO-PRO changes, by the end of its name.
@@ -35,16 +38,22 @@ def any_perturbed(suites: Iterable[str]) -> bool:
     return any(_SUITE.fullmatch(suite) for suite in suites)
 
 
-def by_suite(rows: pl.DataFrame, asked: pl.DataFrame) -> pl.DataFrame:
+def by_suite(question: Question, asked: pl.DataFrame, objects: pl.DataFrame | None) -> pl.DataFrame:
     """A row a suite: kind (what was changed), suite, solved, did, named, num_episodes. Every task weighs the same.
 
     Args:
-        rows: of each episode suite, task_id, episode_index, solved (0 or 1) and named, log2 of the attention to what
-            the task names over what its area gives it; null where that is not known.
+        question: its selected episodes.
         asked: of `behaviour`: what was told and done.
+        objects: of `object_values`; None: not known.
     """
-    did = asked.select("suite", "task_id", "episode_index", did=pl.col("as_told").cast(pl.Float64))
-    rows = rows.join(did, on=("suite", "task_id", "episode_index"), how="left")
+    schema = {**dict(zip(EPISODE_ID, (pl.String, pl.Int64, pl.Int64), strict=True)), "solved": pl.Float64}
+    rows = pl.DataFrame([(*one.key, one.episode.attributes.success) for one in question.selected], schema, orient="row")
+    rows = rows.join(asked.select(*EPISODE_ID, did=pl.col("as_told").cast(pl.Float64)), on=EPISODE_ID, how="left")
+    if objects is None:
+        rows = rows.with_columns(named=pl.lit(None, pl.Float64))
+    else:
+        named = objects.filter(kind="class", item=CLASSES[0]).select(*EPISODE_ID, named="value")
+        rows = rows.join(named, on=EPISODE_ID, how="left")
     means = [pl.mean("solved", "did", "named")]
     tasks = rows.group_by("suite", "task_id").agg(pl.len().alias("num_episodes"), *means)
     suites = tasks.group_by("suite").agg(pl.sum("num_episodes"), *means).sort("suite")

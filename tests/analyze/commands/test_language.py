@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from math import factorial
+from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -203,6 +204,8 @@ def test_another_prompt_is_told_first(tmp_path):
 def test_other_words_for_the_told_goal_count_as_done():
     for told, same in (("Touch the RED cube.", False), ("hit the crimson cube", True)):
         asked = did([(0, {0: 5}), (0, {})], told=told, same=same)
-        rows = asked.select("suite", "task_id", "episode_index", solved=pl.lit(0.5), named=pl.lit(0.0))
-        assert by_suite(rows, asked)["did"].to_list() == [0.5]
+        unknown = SimpleNamespace(attributes=SimpleNamespace(success=None))
+        keys = asked.select("suite", "task_id", "episode_index").rows()
+        question = SimpleNamespace(selected=[SimpleNamespace(key=key, episode=unknown) for key in keys])
+        assert by_suite(question, asked, None)["did"].to_list() == [0.5]
         assert "in 1 of 2" in listens(with_choices(asked)).sentence
