@@ -120,16 +120,18 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     from vla_attention.schemas.command_line import format_bytes
     from vla_attention.schemas.errors import Note
 
+    # Before the numbers of all episodes are waited for.
+    episode = None if arguments.file is None else _wanted(arguments, stores[0].store)[0]
     if arguments.site is not None:
         about = format_bytes(site_size(stores, arguments.heads))
         print(f"About {about} for {sum(len(store.store.episodes) for store in stores)} episodes.", flush=True)
     for store in stores:
         if failed := store.summary.wait():
             warnings.warn(f"Not every episode of {store.store.path} has numbers: {failed}", Note, stacklevel=2)
-    if arguments.site is not None:
+    if episode is None:
         print(write_site(arguments.site, stores, arguments.heads))
-        return
-    print(write_page_file(arguments.file, stores[0], _wanted(arguments, stores[0].store)[0], arguments.heads))
+    else:
+        print(write_page_file(arguments.file, stores[0], episode, arguments.heads))
 
 
 def _write_recordings(arguments: argparse.Namespace, store: Store) -> None:
