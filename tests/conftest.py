@@ -14,6 +14,7 @@ import pytest
 from hypothesis import settings
 
 from tests.kit.examples import PROFILES
+from tests.kit.jitter import jitter
 from vla_attention.schemas.threads import use_threads
 
 # Before a test module imports torch or numpy: several threads make small models slower. OMP_NUM_THREADS overrides.
@@ -44,11 +45,14 @@ if _MEMORY.is_dir() and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMOR
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="run what make test-thorough runs too")
+    parser.addoption("--jitter", nargs="?", const="0", metavar="SEED", help="change last bits: tests/kit/jitter/jitter.py")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     # `-m thorough`, alone or in an expression, asks for these tests as well.
     config.option.thorough = config.option.thorough or "thorough" in config.option.markexpr
+    if config.option.jitter is not None:
+        jitter.switch_on(config.option.jitter)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
