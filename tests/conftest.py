@@ -45,7 +45,7 @@ if _MEMORY.is_dir() and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMOR
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="run what make test-thorough runs too")
-    parser.addoption("--jitter", nargs="?", const="0", metavar="SEED", help="change last bits: tests/kit/jitter/jitter.py")
+    parser.addoption("--jitter", nargs="?", const="0", metavar="SEED", help="change last bits: see tests/kit/jitter")
 
 
 def pytest_configure(config: pytest.Config) -> None:

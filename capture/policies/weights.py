@@ -8,11 +8,12 @@ from __future__ import annotations
 import hashlib
 import zlib
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.schemas.errors import UserError, listing
@@ -96,8 +97,18 @@ Model = TypeVar("Model", bound=nn.Module)
 
 def make_empty(make: Callable[[], Model]) -> Model:
     """Return a model whose tensors have shapes and precisions, but no memory (torch's meta device)."""
-    with torch.device("meta"):
+    with torch.device("meta"), _NoRandomNumbers():
         return make()
+
+
+class _NoRandomNumbers(TorchFunctionMode):
+    """Modules draw no initial weights. For tensors without memory, torch would load its compiler to do so: seconds."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if getattr(func, "__module__", "") == nn.init.__name__:
+            return kwargs["tensor"] if "tensor" in kwargs else args[0]
+        return func(*args, **kwargs)
 
 
 def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:

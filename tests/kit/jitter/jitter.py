@@ -15,8 +15,10 @@ that tests start, too: `sitecustomize.py` beside this file installs it there.
 from __future__ import annotations
 
 import ast
+import marshal
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from importlib.abc import Loader, MetaPathFinder
@@ -29,6 +31,8 @@ from zlib import crc32
 #: The seed; processes that tests start inherit it.
 SEED = "VLA_JITTER"
 CHANGED, DRAWS = ("vla_attention.analyze", "vla_attention.schemas"), "vla_attention.analyze.render"
+#: What was compiled, by its text.
+_COMPILED = Path(tempfile.gettempdir()) / f"jittered-{sys.implementation.cache_tag}"
 #: Methods and functions whose last bits hang on the kernel. Square roots and quotients are exact everywhere.
 ADD_UP = {"sum", "mean", "std", "var", "dot", "matmul", "einsum", "tensordot", "average", "reduceat", "norm", "nanmean"}
 CURVES = {"exp", "expm1", "log", "log1p", "log2", "log10", "power", "tanh", "sin", "cos", "arctan2", "arccos"}
@@ -104,11 +108,21 @@ def _changed_tree(file: str) -> ast.Module:
 
 
 class _Changed(SourceFileLoader):
-    """Compiles a module anew with its sums wrapped; what was compiled of it before is not read."""
+    """Compiles a module with its sums wrapped, once for all processes; Python's own compiled file is not read."""
 
     def get_code(self, fullname: str) -> CodeType:
         file = self.get_filename(fullname)
-        return compile(_changed_tree(file), file, "exec", dont_inherit=True)
+        text = Path(file).read_bytes() + Path(__file__).read_bytes() + file.encode()
+        kept = _COMPILED / f"{crc32(text):08x}-{fullname}"
+        if not kept.exists():
+            code = compile(_changed_tree(file), file, "exec", dont_inherit=True)
+            _COMPILED.mkdir(exist_ok=True)
+            own = kept.with_name(f"{kept.name}-{os.getpid()}")
+            own.write_bytes(marshal.dumps(code))
+            own.replace(kept)
+        code = marshal.loads(kept.read_bytes())
+        assert isinstance(code, CodeType)
+        return code
 
     def exec_module(self, module: ModuleType) -> None:
         vars(module)["_jittered"] = jittered
