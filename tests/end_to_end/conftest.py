@@ -20,6 +20,8 @@ DUMMY = (
     "4",
     "--max-steps",
     "12",
+    "--num-envs",
+    "1",  # a simulator in a process of its own imports everything again
 )
 
 
