@@ -5,7 +5,6 @@ Where two runs have different digests, `run_differences` says in which fields.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
@@ -52,10 +51,11 @@ def bytes_digest(content: bytes) -> str:
 
 def run_configuration(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """The root's attributes, as they stand in its `zarr.json`, without the job records (`JOB_RECORDS`)."""
-    configuration: dict[str, Any] = copy.deepcopy(dict(attributes))
+    configuration = dict(attributes)
     for *parents, field in JOB_RECORDS:
         holder = configuration
         for parent in parents:
+            holder[parent] = dict(holder[parent])  # the caller's keeps its fields
             holder = holder[parent]
         holder.pop(field, None)
     return configuration

@@ -23,7 +23,7 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 
 COMMAND = ["exchange", "pi", "--checkpoint", "untrained-tiny", "--task-suite", "cubes", "--num-envs", "1",
-           "--replan-steps", "2", "--max-steps", "24", "--layers", "0"]  # fmt: skip
+           "--replan-steps", "4", "--max-steps", "24", "--layers", "0"]  # fmt: skip
 
 
 @pytest.mark.simulator

@@ -19,6 +19,7 @@ from tests.kit.stores import StoreSpec, write_store
 from tests.kit.strategies import episode_tokens
 from tests.kit.uniform_cases import TABLE, tokens_of_case, write_case
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps
+from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.masses import uniform_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -43,7 +44,7 @@ def test_means_and_lifts_are_those_of_the_table(tmp_path, case, uniform):
         found = uniform_keys(question.selected[0], question.selection).mean(axis=(1, 2, 3))
         wanted = np.array(expected["uniform"])
         np.testing.assert_allclose(np.broadcast_to(found, wanted.shape), wanted, rtol=CLOSE, atol=1e-9)
-        masses = run.analyze(**asked)["replans_groups"].filter(layer="layers_avg")
+        masses = levels_of(question).groups("replan").collect()
         for replan, lifts in enumerate(expected["lifts"]):
             shown = masses.filter(replan=replan)
             for group, lift in lifts.items():

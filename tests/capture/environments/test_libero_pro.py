@@ -66,9 +66,10 @@ def test_sentences_of_each_kind():
 
 
 def _with(tmp_path: Path, change) -> Path:
-    """A copy of the archive in which `change` changed the folder."""
-    unpack(libero_pro._ARCHIVE, tmp_path)
-    change(tmp_path / "libero_pro" / "libero_goal_lan")
+    """An archive of one suite, whose folder `change` changed."""
+    unpack(libero_pro._ARCHIVE, tmp_path / "all")
+    shutil.move(tmp_path / "all/libero_pro/libero_goal_lan", tmp_path / "libero_pro/libero_goal_lan")
+    change(tmp_path / "libero_pro/libero_goal_lan")
     write_tar(tmp_path / "libero_pro", tmp_path / "changed.tar.xz")
     return tmp_path / "changed.tar.xz"
 

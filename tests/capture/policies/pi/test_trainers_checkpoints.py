@@ -11,6 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from tests.capture.run.test_doctor import checkpoint_of
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
@@ -156,29 +157,23 @@ def two_statistics(folder: Path) -> None:
     ],
 )
 def test_what_else_trainers_leave_is_said_with_the_next_step(
-    tmp_path, tokenizer, capsys, change: Callable[[Path], None], said: str
+    tmp_path, tokenizer, change: Callable[[Path], None], said: str
 ):
     """By capture, and by the doctor, which loads nothing."""
     folder = trained(tmp_path / "checkpoint")
     change(folder)
     with pytest.raises(UserError, match=said):
         build(folder, tokenizer, model_config=CASE)
-    words = ["--checkpoint", str(folder), "--model-config", str(CASE), "--tokenizer", tokenizer]
-    capsys.readouterr()
-    assert capture(["doctor", "pi", *words]) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines if " checkpoint " in line[:20]] == ["MISSING"]
+    with pytest.raises(UserError):
+        checkpoint_of("pi", *words_of(folder, tokenizer))
 
 
-def test_doctor_is_content_with_a_whole_checkpoint(tmp_path, tokenizer, capsys):
-    folder = trained(tmp_path / "checkpoint")
-    words = ["--checkpoint", str(folder), "--model-config", str(CASE), "--tokenizer", tokenizer]
-    assert "MISSING  checkpoint" not in (capture(["doctor", "pi", *words]), capsys.readouterr().out)[1]
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    for family, option in (("pi", "--checkpoint"), ("cosmos", "--ckpt-path")):
-        assert capture(["doctor", family, option, str(empty)]) == 1
-        assert "MISSING  checkpoint" in capsys.readouterr().out
+def words_of(folder: Path, tokenizer: str) -> list[str]:
+    return ["--checkpoint", str(folder), "--model-config", str(CASE), "--tokenizer", tokenizer]
+
+
+def test_doctor_is_content_with_a_whole_checkpoint(tmp_path, tokenizer):
+    assert checkpoint_of("pi", *words_of(trained(tmp_path / "checkpoint"), tokenizer))[0] == "ok"
 
 
 @pytest.mark.parametrize("cached", [False, True])
