@@ -94,17 +94,12 @@ def uncached(monkeypatch) -> Callable[..., list[pl.DataFrame]]:
 QUESTIONS: tuple[dict[str, object], ...] = (
     SPANS,
     WORDS,
-    {"grouping": "instruction"},
-    {"grouping": "cameras", "layers": 2},
     {"grouping": "cameras", "layers": [2, 0]},
-    {"grouping": "cameras", "denoise": "last"},
-    {"grouping": "cameras", "heads": 1},
+    {"grouping": "cameras", "denoise": "last", "heads": 1},
     {"grouping": "cameras", "per_head": True},
     {"grouping": "cameras", "tasks": 1},
-    {"grouping": "objects"},
     {"groups": {"bowl": "word:bowl", "rest": "*"}},
     {"groups": {"rest": "*", "bowl": "word:bowl"}},
-    {"groups": {"plate": "word:plate", "rest": "*"}},
 )
 
 

@@ -18,7 +18,7 @@ from vla_attention.schemas.interventions import ImageChange, Interventions, Nois
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
 
-SPEC = replace(BASE, tasks=(0, 1), frames=True, plant_actions=base_actions)
+SPEC = replace(BASE, tasks=(1,), episodes=1, frames=True, plant_actions=base_actions)
 CUT = knockout("without_state", "role:state")
 #: The replan that is another one.
 WHERE = (1, 0, 3)

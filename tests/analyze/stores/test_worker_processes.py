@@ -45,14 +45,9 @@ def test_results_come_in_order_from_other_processes(two):
 def tables(path):
     run = va.open(path)
     of_words, objects = run.analyze(groups={"bowl": "word:bowl", "rest": "*"}), run.objects()
-    yield from (of_words[level] for level in ("tasks", "episodes", "steps"))
-    yield run.analyze(per_head=True)["steps_groups"]
-    yield run.analyze()["contributions_steps"]
-    yield run.words()["words"]
-    yield from (run.analyze(by=by)["by"] for by in (("layer", "head"), ("denoise",)))
-    yield run.analyze(without_sinks="")["sinks"]
+    yield from (of_words[level] for level in ("tasks", "episodes", "steps", "contributions_steps"))
+    yield run.analyze(per_head=True, without_sinks="")["steps_groups"]
     yield from (objects[f"{table}_episodes"] for table in ("objects", "pointing", "iou"))
-    yield run.analyze(by=("time",))["by"]
     yield run.effects()["effects"]
 
 
