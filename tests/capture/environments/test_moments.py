@@ -75,7 +75,14 @@ def cubes() -> Iterator[CubesEnvironment]:
     environment.close()
 
 
-@pytest.mark.parametrize("suite", ["cubes_harder", "robosuite", pytest.param("libero_goal", marks=pytest.mark.libero)])
+@pytest.mark.parametrize(
+    "suite",
+    [
+        "cubes_harder",
+        pytest.param("robosuite", marks=pytest.mark.thorough),
+        pytest.param("libero_goal", marks=pytest.mark.libero),
+    ],
+)
 def test_poses_are_those_of_the_simulator(suite, request):
     if suite == "libero_goal":
         environment = request.getfixturevalue("goal_suite")
@@ -107,7 +114,7 @@ def test_poses_are_those_of_the_simulator(suite, request):
         environment.close()
 
 
-@pytest.mark.parametrize("number", [5, 12, 17])
+@pytest.mark.parametrize("number", thorough_except([12], [5, 12, 17]))
 def test_an_expert_reaches_its_own_goal_and_no_other_of_its_kind(cubes, number):
     task, simulator = CUBE_TASKS[number], cubes.simulator
     cubes.give_task(task)
