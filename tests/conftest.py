@@ -6,7 +6,10 @@ import asyncio
 import os
 import shutil
 import signal
+import sys
 import threading
+import weakref
+from collections import defaultdict
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future
 from pathlib import Path
@@ -100,6 +103,39 @@ def _zarr_works_without_threads() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(asyncio, "to_thread", call)
         patch.setattr(asyncio, "run_coroutine_threadsafe", run_here)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _readers_of_foreign_files_are_kept() -> Iterator[None]:
+    """Some import torch, which takes two seconds: what one reader has closed serves the next one of the same limits."""
+    from vla_attention.capture.foreign_files import bounded
+    from vla_attention.capture.foreign_files.bounded import BoundedProcess
+
+    idle: dict[tuple[object, ...], list[dict[str, Any]]] = defaultdict(list)
+    begin, end = BoundedProcess._start, BoundedProcess.close
+
+    def kind(one: BoundedProcess) -> tuple[object, ...]:
+        return (os.getpid(), one._most_bytes, one._processor_seconds, *map(str, sys.path))
+
+    def start(self: BoundedProcess) -> bool:
+        if self._end is None and idle[kind(self)]:
+            vars(self).update(idle[kind(self)].pop())
+            self._end = weakref.finalize(self, bounded._end, self._process, self._connection, self._owner)
+        return begin(self)
+
+    def close(self: BoundedProcess) -> None:
+        # Within a call it is closed because of what the file did to it.
+        if self._end is None or self._one_at_a_time.locked() or self._process.poll() is not None:
+            return end(self)
+        self._end.detach()
+        self._end = None
+        idle[kind(self)].append({name: vars(self)[name] for name in ("_connection", "_process", "_owner")})
+        return None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(BoundedProcess, "_start", start)
+        patch.setattr(BoundedProcess, "close", close)
         yield
 
 
