@@ -29,9 +29,7 @@ def small_tokenizer(tmp_path_factory) -> Path:
 
 
 @pytest.mark.simulator
-@pytest.mark.parametrize(
-    "name", thorough_except(("pi0_batch2/checkpoint", "pi05_batch2/checkpoint_lerobot"), CHECKPOINTS)
-)
+@pytest.mark.parametrize("name", thorough_except(("pi05_batch2/checkpoint_lerobot",), CHECKPOINTS))
 def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small_tokenizer, tmp_path, capsys):
     store = tmp_path / "store.zarr"
     arguments = [

@@ -18,7 +18,7 @@ from vla_attention.capture.environments.suites import find_suite, make_environme
 SUITE = find_suite("robosuite")
 SETTINGS = EnvironmentSettings()
 STACK = 1
-ACTIONS = np.random.default_rng(1).uniform(-1, 1, (6, 7))
+ACTIONS = np.random.default_rng(1).uniform(-1, 1, (3, 7))
 
 
 def act(environment: Environment, index: int, seed: int = 7) -> Observation:

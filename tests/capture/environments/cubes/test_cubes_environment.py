@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from examples.cubes_policy.experts import expert_action, read_state
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, CubeTask, Target, Verb
@@ -71,17 +72,17 @@ def test_cubes_are_seen_in_their_colours(environment: CubesEnvironment) -> None:
     assert [thing.of_interest for thing in environment.objects] == [True, False, False, False, False]
 
 
-@pytest.mark.parametrize(
-    "number",
-    [
-        _number("touch", "green"),
-        _number("lift", "blue"),
-        _number("push_left", "red"),
-        _number("push_right", "green"),
-        _number("lift", "leftmost"),
-        _number("put_on", "red", "blue"),
-    ],
-)
+EXPERTS = [
+    _number("touch", "green"),
+    _number("lift", "blue"),
+    _number("push_left", "red"),
+    _number("push_right", "green"),
+    _number("lift", "leftmost"),
+    _number("put_on", "red", "blue"),
+]
+
+
+@pytest.mark.parametrize("number", thorough_except((EXPERTS[0], EXPERTS[-1]), EXPERTS))
 def test_experts_solve_the_tasks_and_nothing_else_does(environment: CubesEnvironment, number: int) -> None:
     task = CUBE_TASKS[number]
     environment.give_task(task)
