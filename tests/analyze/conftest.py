@@ -1,4 +1,5 @@
-"""Tests draw where they have the mark `drawn`, PNG files of low resolution; elsewhere a file has one white pixel.
+"""Tests draw where they have the mark `drawn`, PNG files of low resolution; elsewhere a file has one white pixel, and
+figures of tables are not even laid out.
 
 With `--thorough` all tests and fixtures draw, and those with the mark as the product does, PDF files too.
 """
@@ -6,13 +7,15 @@ With `--thorough` all tests and fixtures draw, and those with the mark as the pr
 from __future__ import annotations
 
 import io
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from PIL import Image
 
+from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render import figures, page
 from vla_attention.analyze.render.style import Style
 
 HERE, DRAW = Path(__file__).parent, Style.content
@@ -25,6 +28,10 @@ def blank(_style: Style, _canvas: Any, kind: str) -> bytes:
     buffer = io.BytesIO()
     Image.new("RGB", (1, 1), "white").save(buffer, format=kind)
     return buffer.getvalue()
+
+
+def blank_figure(_figure: Figure, style: Style, kinds: Sequence[str]) -> tuple[list[bytes], float]:
+    return [blank(style, None, kind) for kind in kinds], style.width(wide=False)
 
 
 def draw_quickly(style: Style, canvas: Any, kind: str) -> bytes:
@@ -40,4 +47,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     with pytest.MonkeyPatch.context() as patch:
         if item.path.is_relative_to(HERE) and not (thorough and drawn):
             patch.setattr(Style, "content", draw_quickly if thorough or drawn else blank)
+            if not (thorough or drawn):
+                for module in (figures, page):
+                    patch.setattr(module, "content", blank_figure)
         return (yield)
