@@ -130,7 +130,7 @@ def test_a_disk_that_is_full_when_the_store_is_made(tmp_path):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     for kind in ("set", "fsync", "rename"):
-        with before_call(kind, 0, fail), pytest.raises(BadArgument, match="No space left"):
+        with before_call(kind, 0, fail), pytest.raises(BadArgument):
             open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
         assert list(tmp_path.iterdir()) == []
 
