@@ -200,10 +200,10 @@ def test_files_folders_and_patterns_are_found_once(tmp_path):
     assert find_results([str(tmp_path / "run_*/attention_ratio_results_*.json"), str(goal)]) == [goal, ten]
     assert find_results([str(tmp_path / "run_*")]) == [goal, ten]
     assert find_results([str(plain)]) == [plain / "renamed.json"]
-    with pytest.raises(ResultsNotFound, match=r"Nothing matches .*run_x.*run_a/attention_ratio_results_goal"):
+    with pytest.raises(ResultsNotFound, match=r"run_x.*run_a/attention_ratio_results_goal"):
         find_results([str(tmp_path / "run_x*/a.json")])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="no results file in"):
+    with pytest.raises(FileNotFoundError, match="empty"):
         find_results([str(tmp_path / "empty")])
 
 
