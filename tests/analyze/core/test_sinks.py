@@ -159,7 +159,7 @@ def test_without_sinks_every_measure_is_that_of_the_other_keys(data):
         question = question_about(path, grouping)
         sinks = search_sinks(question, rule).sinks
         if any(keys == set(np.flatnonzero(tokens.valid.any(axis=0))) for keys in out_by_task(sinks)):
-            with pytest.raises(BadArgument, match="Every valid key of task"):
+            with pytest.raises(BadArgument, match="task"):
                 without_sinks(question, sinks, rule)
             return
         corrected = without_sinks(question, sinks, rule)
@@ -232,4 +232,4 @@ def test_a_sink_of_some_heads_is_found_and_taken_out_where_it_is_widespread(tmp_
     strict = SinkRule(heads=0.5)
     kept = without_sinks(question, search_sinks(question, strict).sinks, strict)
     assert not any(item.without for item in kept.selected)
-    assert "Sinks of fewer heads stay in: 2 keys, counted in every task by itself" in kept.notes[-1]
+    assert " 2 keys" in kept.notes[-1]
