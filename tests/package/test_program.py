@@ -22,18 +22,18 @@ def test_capture_is_vla_capture(capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "named"),
     [
-        (["anlyze"], "There is no command 'anlyze'. Did you mean 'analyze'?"),
-        (["nothing\x1b[31m"], "There is no command 'nothing\\x1b[31m'. Commands: example, analyze"),
+        (["anlyze"], "'analyze'"),
+        (["nothing\x1b[31m"], "'nothing\\x1b[31m'"),
         (["analyze", "nowhere.zarr"], "nowhere.zarr"),
     ],
 )
-def test_a_mistake_is_one_sentence(words, said):
+def test_a_mistake_is_named_in_one_line(words, named):
     done = subprocess.run([sys.executable, "-m", "vla_attention", *words], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert said in done.stderr
+    assert named in done.stderr
     assert done.stderr.count("\n") == 1
 
 
@@ -56,5 +56,5 @@ def test_without_torch_the_recorder_says_how_to_install_it(use):
         "except ImportError as error:\n    print(type(error).__name__, error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("MissingDependency torch is not installed")
+    assert done.stdout.startswith("MissingDependency torch")
     assert "pip install 'vla-attention[capture]'" in done.stdout
