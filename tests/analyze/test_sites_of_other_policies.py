@@ -56,9 +56,9 @@ def test_absent_keys_are_never_called_padding(stores, capsys):
 
 
 def test_layers_that_a_site_lacks(stores):
-    with pytest.raises(BadArgument, match=r"Layers 0 were not recorded at site 'cross'; recorded blocks: 1, 3; other"):
+    with pytest.raises(BadArgument, match=r"Layers 0 .*'cross'; .* 1, 3"):
         question_about(stores["alternating"], site="cross", layers=(0, 1))
-    with pytest.raises(BadArgument, match=r"Head 2 was not recorded at site 'cross'; recorded heads: 0, 1\."):
+    with pytest.raises(BadArgument, match=r"Head 2 .*'cross'; .* 0, 1\."):
         question_about(stores["alternating"], site="cross", heads=(2,))
     question = question_about(stores["alternating"], site="cross", layers=(3,))
     assert (question.selection.layers, question.selection.blocks) == ((1,), (3,))
@@ -96,7 +96,7 @@ def test_contributions_of_sites_in_different_blocks(stores):
     assert row["geometric_mean"] == pytest.approx(np.exp(per_episode["log"].mean()), rel=1e-9)
     assert row["uniform_ratio"] > 0
     assert row["ratio_lift"] > 0
-    assert any("a ratio of visual to linguistic attention is not defined" in note for note in result.notes)
+    assert any("visual to linguistic" in note for note in result.notes)
     assert side_norms(question_about(stores["split"], layers=(0, 2))) is None
 
 
