@@ -15,8 +15,6 @@ from vla_attention.schemas.stop_signals import run_until_stopped, stops_kept_fro
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
 
-SENTENCE = "\nprogram: stopped; all is kept.\n"
-
 
 def give(number: int = signal.SIGINT) -> None:
     os.kill(os.getpid(), number)
@@ -26,13 +24,13 @@ def run(command) -> int:
     return run_until_stopped("program", command, "all is kept.")
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "sentence"),
-    [(signal.SIGINT, 130, SENTENCE), (signal.SIGTERM, 143, "program: stopped by SIGTERM; all is kept.\n")],
-)
-def test_a_signal_ends_with_its_code_and_one_line(capsys, number, code, sentence):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_with_its_code_and_one_line(capsys, number, code):
     assert run(lambda: give(number) or 0) == code
-    assert capsys.readouterr().err == sentence
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("program: ")
+    assert line.endswith("all is kept.")
+    assert ("SIGTERM" in line) == (number == signal.SIGTERM)
 
 
 def test_more_signals_while_it_cleans_up_change_nothing(capsys):
@@ -50,7 +48,7 @@ def test_more_signals_while_it_cleans_up_change_nothing(capsys):
 
     assert run(command) == 130
     assert cleaned
-    assert capsys.readouterr().err == SENTENCE
+    assert capsys.readouterr().err.count("all is kept.") == 1
 
 
 def test_children_never_get_it():

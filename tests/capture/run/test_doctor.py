@@ -86,7 +86,6 @@ def test_drawing(renderer: str, status: str):
 def test_a_picture_is_really_drawn():
     status, text = find_drawing(find_suite("cubes"), None)
     assert status in ("ok", "note"), text
-    assert "draws with" in text
 
 
 class NoCuda:

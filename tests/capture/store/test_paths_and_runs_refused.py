@@ -170,7 +170,7 @@ def test_a_path_without_the_suffix_is_refused(tmp_path, name):
 @pytest.mark.parametrize("parent", ["file/a.zarr"])
 def test_a_parent_that_is_a_file(tmp_path, parent):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(BadArgument, match="file"):
+    with pytest.raises(BadArgument, match=parent):
         write_store(tmp_path / parent, spec=SPEC)
 
 

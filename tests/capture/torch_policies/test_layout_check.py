@@ -86,19 +86,19 @@ STATE_LAST = with_spans(
 
 
 @pytest.mark.parametrize(
-    ("layout", "selector", "verdict"),
+    ("layout", "selector", "still", "moved"),
     [
-        (IMAGE_LAST, "camera:front", "no: image_front did not move; prompt (keys 0..3) moved"),
-        (IMAGE_LAST, "word:bowl", "no: prompt (key 3) did not move; image_front (key 7) moved"),
-        (STATE_LAST, "span:state", "no: state did not move; actions (key 10) moved"),
+        (IMAGE_LAST, "camera:front", "image_front", "prompt (keys 0..3)"),
+        (IMAGE_LAST, "word:bowl", "prompt (key 3)", "image_front (key 7)"),
+        (STATE_LAST, "span:state", "state", "actions (key 10)"),
     ],
 )
-def test_a_wrong_layout_does_not(policy, layout, selector, verdict):
+def test_a_wrong_layout_does_not(policy, layout, selector, still, moved):
     found = check(policy, layout, {selector: changes(policy)[selector]})
-    assert found.fits == (verdict == "yes")
-    assert str(found).splitlines()[-1].endswith(verdict)
-    if not found.fits:
-        assert "1 of 1" in str(found)
+    assert not found.fits
+    verdict = str(found).splitlines()[-1]
+    assert -1 < verdict.find(f" {still} ") < verdict.find(f" {moved} ")
+    assert "1 of 1" in str(found)
 
 
 def test_a_prompt_of_changing_length_and_generated_tokens():
@@ -112,7 +112,7 @@ def test_a_prompt_of_changing_length_and_generated_tokens():
     settings = {"tokenizer": policy.tokenizer, "instruction": TEXT}
     found = va.check_layout(policy, lambda: policy.act(picture, TEXT), token_layout(), perturb, **settings)
     assert [change.fits for change in found.changes] == [True, True, False]
-    assert found.changes[2].verdict == f"no: prompt (key {PATCHES + 5}) moved"
+    assert f" prompt (key {PATCHES + 5}) " in found.changes[2].verdict
     with pytest.raises(BadArgument, match="'span:generated'"):
         va.check_layout(
             policy, lambda: policy.act(picture, TEXT), token_layout(), {"span:generated": perturb["word:the"]}
