@@ -106,13 +106,9 @@ def test_queries_can_be_pooled_by_action_step(tmp_path):
     assert analyze(["store", "verify", str(store)]) == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [(["--query-frame", "actoin"], "'action'"), (["--prefer-S", "12"], "--prefer-S 12")],
-)
-def test_bad_input_is_named_in_one_line(arguments, named, tmp_path, capsys):
-    given = ["cosmos", "--ckpt-path", "untrained-tiny", "--output", str(tmp_path / "a.zarr"), *arguments]
-    assert capture(given) == 2
+def test_bad_input_is_named_in_one_line(tmp_path, capsys):
+    given = ["cosmos", "--ckpt-path", "untrained-tiny", "--output", str(tmp_path / "a.zarr")]
+    assert capture([*given, "--query-frame", "actoin"]) == 2
     said = capsys.readouterr().err.strip()
-    assert named in said
+    assert "'action'" in said
     assert "\n" not in said
