@@ -100,32 +100,29 @@ def test_contributions_of_sites_in_different_blocks(stores):
     assert side_norms(question_about(stores["split"], layers=(0, 2))) is None
 
 
-#: What each command says of any of the stores.
-SAYS = {
-    "analyze": "",
-    "analyze --list": "not known: picture size",
-    "analyze --by layer,head": "",
-    "analyze --by time": "",
-    "words": "",
-    "overlay": "",
-    "store verify": "all whole",
-    "report": "",
-}
+COMMANDS = (
+    "analyze",
+    "analyze --list",
+    "analyze --by layer,head",
+    "analyze --by time",
+    "words",
+    "overlay",
+    "store verify",
+    "report",
+)
 #: Every command once, and every store with the default question.
-FAST = [(command, "growing") for command in SAYS if command != "report"]
+FAST = [(command, "growing") for command in COMMANDS if command != "report"]
 FAST += [("analyze", name) for name in (*KINDS, "bare")]
 
 
-@pytest.mark.parametrize(("command", "name"), thorough_except(FAST, product(SAYS, (*KINDS, "bare")), several=True))
-def test_commands(stores, tmp_path, capsys, command, name):
+@pytest.mark.parametrize(("command", "name"), thorough_except(FAST, product(COMMANDS, (*KINDS, "bare")), several=True))
+def test_commands(stores, tmp_path, command, name):
     words = command.split()
     at = 1 + (words[0] == "store")
     given = [*words[:at], str(stores[name]), *words[at:]]
     if command != "store verify":
         given += ["--output", str(tmp_path / "out")]
     assert analyze(given) == 0
-    printed = capsys.readouterr()
-    assert SAYS[command] in " ".join(printed.out.split())
 
 
 def test_runs_are_compared_episode_by_episode_where_the_first_state_is_not_known(stores, tmp_path, capsys):

@@ -17,7 +17,7 @@ from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.reader import open_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
-NAMED = "among its episodes: README.md, notes, task000_episode007, task0_episode1, task1\\x1b; they are no episodes."
+NAMED = ": README.md, notes, task000_episode007, task0_episode1, task1\\x1b;"
 EPISODES = [f"task00{task}_episode00{episode}" for task in (0, 1) for episode in (0, 1)]
 
 

@@ -274,15 +274,15 @@ def test_mistakes_are_named_in_one_line(stores, words, named, capsys):
 
 
 OUTCOMES = {
-    "six lost": ([True] * 8, [False] * 6 + [True] * 2, "does worse", 0.03125),
-    "five lost": ([True] * 8, [False] * 5 + [True] * 3, "Not shown to differ", 0.0625),
-    "as many won": ([True] * 4 + [False] * 4, [False] * 4 + [True] * 4, "Not shown to differ", 1.0),
+    "six lost": ([True] * 8, [False] * 6 + [True] * 2, 0.03125),
+    "five lost": ([True] * 8, [False] * 5 + [True] * 3, 0.0625),
+    "as many won": ([True] * 4 + [False] * 4, [False] * 4 + [True] * 4, 1.0),
 }
 
 
 @pytest.mark.parametrize("case", OUTCOMES)
 def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, monkeypatch, case):
-    first, other, verdict, p = OUTCOMES[case]
+    first, other, p = OUTCOMES[case]
     runs = opened(stores, "base", "higher")
     for run, outcomes in zip(runs, (first, other), strict=True):
         episodes = run.question.selected[:8]
@@ -296,7 +296,6 @@ def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, mo
             )
     found = compare(runs)
     (finding,) = (finding for finding in found.findings if "better" in finding.asks)
-    assert verdict in finding.sentence
     assert finding.numbers["p"] == pytest.approx(p)
     assert (finding.numbers["n"], finding.numbers["lost"]) == (8, sum(a > b for a, b in zip(first, other, strict=True)))
     assert ("6 pairs" in finding.limit) == (p > 0.05)

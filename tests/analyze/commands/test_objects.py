@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -305,12 +306,12 @@ def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     assert numbers["enrichment_low"] < numbers["enrichment"] < numbers["enrichment_high"]
 
 
-def test_a_mistake_ends_with_one_sentence(follower_store, tmp_path, capsys):
-    for arguments, said in (
-        (["--task", "9"], "has no episode of task 9; it has tasks 0, 1"),
-        (["--by", "heads"], "Did you mean 'head'?"),
+def test_a_mistake_is_named(follower_store, tmp_path, capsys):
+    for arguments, named in (
+        (["--task", "9"], "task 9; .* 0, 1"),
+        (["--by", "heads"], "'head'"),
     ):
         assert main(["objects", str(follower_store), "--output", str(tmp_path), *arguments]) == 2
         error = capsys.readouterr().err
-        assert said in error
+        assert re.search(named, error)
         assert "Traceback" not in error

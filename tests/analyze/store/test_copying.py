@@ -190,13 +190,13 @@ def test_tar_files_are_the_store_again_and_a_copy_of_them_goes_on(original, tmp_
     assert {**all_bytes(back), NAMES_FILE: b""} == {**all_bytes(original), NAMES_FILE: b""}
     assert copy_store(open_source(tars), back, ()).present == 2
     capsys.readouterr()
-    for words, said in (
-        (["analyze", str(tars)], "are tar files; vla-attention store copy"),
-        (["store", "copy", str(original), str(tars)], "are tar files"),
-        (["store", "copy", str(original), str(back), "--tar"], "its episodes are folders"),
+    for words, named in (
+        (["analyze", str(tars)], "vla-attention store copy"),
+        (["store", "copy", str(original), str(tars)], str(tars)),
+        (["store", "copy", str(original), str(back), "--tar"], str(back)),
     ):
         assert analyze(words) == 2
-        assert said in capsys.readouterr().err
+        assert named in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

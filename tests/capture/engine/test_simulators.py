@@ -86,8 +86,7 @@ def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
     assert record(tmp_path / "a.zarr", 2, *words) == 0
     assert Deadly.lives == [0]
     assert len(ThreadOfTests.started) == 4
-    again = "task000_episode001: its simulator ended (killed by signal 9); the episode begins again."
-    assert capsys.readouterr().out.count(again) == 2
+    assert len(re.findall(r"task000_episode001: .*signal 9\)", capsys.readouterr().out)) == 2
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr" / ".writing").exists()
 

@@ -19,9 +19,9 @@ from vla_attention.schemas.errors import MissingDependency
 CUBES = find_suite("cubes")
 #: Variables with which no machine draws, the reason, and the command that mends it.
 BROKEN = [
-    ({"MUJOCO_EGL_DEVICE_ID": "99"}, "got 99 (RuntimeError)", "unset MUJOCO_EGL_DEVICE_ID"),
-    ({"CUDA_VISIBLE_DEVICES": "98,99"}, "got 98 (RuntimeError)", "export MUJOCO_EGL_DEVICE_ID=0"),
-    ({"MUJOCO_GL": "elg"}, "MUJOCO_GL: elg (RuntimeError)", "unset MUJOCO_GL"),
+    ({"MUJOCO_EGL_DEVICE_ID": "99"}, "99 (RuntimeError)", "unset MUJOCO_EGL_DEVICE_ID"),
+    ({"CUDA_VISIBLE_DEVICES": "98,99"}, "98 (RuntimeError)", "export MUJOCO_EGL_DEVICE_ID=0"),
+    ({"MUJOCO_GL": "elg"}, "elg (RuntimeError)", "unset MUJOCO_GL"),
     (
         {"PYOPENGL_PLATFORM": "osmesa"},
         "PYOPENGL_PLATFORM is 'osmesa' and MUJOCO_GL is 'egl'",
