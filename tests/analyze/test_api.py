@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import re
 from pathlib import Path
 from types import ModuleType
 
@@ -128,18 +129,18 @@ def test_keywords_become_settings(given, expected):
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("call", "named"),
     [
-        (lambda run: run.analyze(layer=3)["tasks"], r"Unknown setting 'layer'\. Did you mean 'layers'"),
-        (lambda run: run.analyze(by=["heads"]), r"Unknown axis for --by 'heads'\. Did you mean 'head'"),
-        (lambda run: run.analyze(layers="two")["tasks"], r"Cannot use 'two' as numbers"),
-        (lambda run: run.analyze(ratio=("a", "b", "c"))["tasks"], r"expected 'A,B/C' or a pair"),
-        (lambda run: run.analyze(layers=1)["tasks"], r"were not recorded"),
-        (lambda run: va.open([]), r"No store was given"),
+        (lambda run: run.analyze(layer=3)["tasks"], "'layer'.*'layers'"),
+        (lambda run: run.analyze(by=["heads"]), "--by 'heads'.*'head'"),
+        (lambda run: run.analyze(layers="two")["tasks"], "'two'"),
+        (lambda run: run.analyze(ratio=("a", "b", "c"))["tasks"], "'A,B/C'"),
+        (lambda run: run.analyze(layers=1)["tasks"], r"\b1\b"),
+        (lambda run: va.open([]), "store"),
     ],
 )
-def test_mistakes_say_what_exists(run, call, message):
-    with pytest.raises((BadArgument, UnknownName), match=message):
+def test_mistakes_say_what_exists(run, call, named):
+    with pytest.raises((BadArgument, UnknownName), match=named):
         call(run)
 
 
@@ -151,7 +152,7 @@ def test_stores_are_opened_by_path_text_or_several(store, other, tmp_path):
     assert both.analyze()["tasks"]["scope"].unique().sort().to_list() == ["all", "combined", "task"]
     with pytest.raises(StoreNotFound):
         va.open(tmp_path / "absent.zarr")
-    with pytest.raises(StoreError, match="both hold"):
+    with pytest.raises(StoreError, match="both"):
         va.open([store, other])
 
 
@@ -159,14 +160,14 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
     run = va.open(write_store(tmp_path / "a.zarr", tasks=()))
     assert run.episodes.height == 0
     assert "0 episodes" in repr(run)
-    with pytest.raises(StoreError, match="no complete episode"):
+    with pytest.raises(StoreError, match="episode"):
         run.analyze()["tasks"]
 
 
 def test_a_group_inside_of_a_store_leads_to_the_store(store, capsys):
     for inside in (store / "episodes", store / "episodes" / "task000_episode000"):
         assert main(["store", "verify", str(inside)]) == 2
-        assert f"is a group inside of a store; give the folder above, {store}." in capsys.readouterr().err
+        assert re.search(rf"{inside} .*{store}\.", capsys.readouterr().err)
 
 
 def test_the_guides_examples(tmp_path, monkeypatch):

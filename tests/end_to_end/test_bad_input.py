@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import pytest
@@ -30,48 +31,47 @@ def run(command, arguments, capsys) -> str:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "named"),
     [
-        (["--task-suite", "libero_spacial"], "Did you mean 'libero_spatial'?"),
-        (["--layers", "6"], "expected block indices 0 to 2, or recorded-call numbers 3 to 5"),
-        (["--num-image-tokens", "256"], "4 keys; leave the option out"),
-        (["--checkpoint", "no/such/folder"], "There is no checkpoint"),
+        (["--task-suite", "libero_spacial"], "'libero_spatial'"),
+        (["--layers", "6"], "0 to 2, .*3 to 5"),
+        (["--num-image-tokens", "256"], r"\b4 keys"),
+        (["--checkpoint", "no/such/folder"], "no/such/folder"),
     ],
 )
-def test_capture(arguments, expected, capsys, tmp_path):
+def test_capture(arguments, named, capsys, tmp_path):
     store = tmp_path / "a.zarr"
-    assert expected in run(capture, [*DUMMY, "--output", store, *arguments], capsys)
+    assert re.search(named, run(capture, [*DUMMY, "--output", store, *arguments], capsys))
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "named"),
     [
-        (["--grouping", "defualt"], "Did you mean 'default'?"),
-        (["--group", "x=camera:base"], "Did you mean 'base_0_rgb'?"),
-        (["--group", "a=word:cube", "--group", "b=role:instruction"], "Groups 'a' and 'b' share"),
-        (["--layers", "6"], "expected block indices 0 to 2"),
+        (["--grouping", "defualt"], "'default'"),
+        (["--group", "x=camera:base"], "'base_0_rgb'"),
+        (["--group", "a=word:cube", "--group", "b=role:instruction"], "'a' and 'b'"),
+        (["--layers", "6"], "0 to 2"),
     ],
 )
-def test_analyze(arguments, expected, tmp_path, capsys):
-    assert expected in run(analyze, [STORED, "--output", tmp_path / "out", *arguments], capsys)
+def test_analyze(arguments, named, tmp_path, capsys):
+    assert named in run(analyze, [STORED, "--output", tmp_path / "out", *arguments], capsys)
     assert not (tmp_path / "out").exists()
 
 
 def test_stores_that_cannot_be_read(tmp_path, capsys):
-    assert "There is no store at" in run(analyze, [STORED.with_name("robosite.zarr")], capsys)
+    assert "robosite.zarr" in run(analyze, [STORED.with_name("robosite.zarr")], capsys)
 
-    assert "is not a store" in run(analyze, [tmp_path], capsys)
+    assert str(tmp_path) in run(analyze, [tmp_path], capsys)
 
     newer = tmp_path / "newer.zarr"
     shutil.copytree(STORED, newer)
     document = json.loads((newer / "zarr.json").read_text())
     document["attributes"]["store_version"] = STORE_VERSION + 1
     (newer / "zarr.json").write_text(json.dumps(document))
-    expected = f"is a store of version {STORE_VERSION + 1}, and this program reads version {STORE_VERSION}"
-    assert expected in run(analyze, [newer], capsys)
+    assert re.search(rf"version {STORE_VERSION + 1}, .*version {STORE_VERSION}\b", run(analyze, [newer], capsys))
 
 
 def test_output_folder_that_cannot_be_written(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     said = run(analyze, [STORED, "--output", tmp_path / "file" / "results", "--no-plots"], capsys)
-    assert "Cannot write results to" in said
+    assert str(tmp_path / "file") in said

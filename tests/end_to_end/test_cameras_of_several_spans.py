@@ -81,7 +81,7 @@ def test_everything_that_goes_by_camera_takes_all_its_keys(data):
         taken = weights(tokens, f"patch:{camera}[{r0 / 8}:{r1 / 8},{c0 / 8}:{c1 / 8}]")
         assert np.flatnonzero(taken[0]).tolist() == inside
         if len(grids) > 1:
-            with pytest.raises(SelectorError, match=f"{len(grids)} grids .* fractions of the whole picture"):
+            with pytest.raises(SelectorError, match=f"{len(grids)} grids"):
                 weights(tokens, f"patch:{camera}[0:1,0:1]")
             assert weights(tokens, f"patch:{camera}[:,:]").sum() == len(layout.patch_keys(camera))
         if tokens.coverage and camera in tokens.coverage:
@@ -198,10 +198,10 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     beside = [key for key in keys if key not in placed]
     names = [span.name for span in layout.camera_spans("front") if span.grid is not None]
-    assert ("The map of front" in printed) == (len(names) > 1 or bool(beside))
-    assert (f"adds the attention on {', '.join(names)}" in printed) == (len(names) > 1)
+    assert ("map of front" in printed) == (len(names) > 1 or bool(beside))
+    assert (f"attention on {', '.join(names)}" in printed) == (len(names) > 1)
     outside = 100 * rows[:, beside].sum() / rows[:, keys].sum()
-    assert (f"{outside:.1f}% of the camera's attention" in printed) == bool(beside)
+    assert (f"{outside:.1f}% of" in printed) == bool(beside)
 
 
 @pytest.mark.parametrize("made", ["tiles and thumbnail"], indirect=True)
@@ -218,7 +218,7 @@ def test_runs_whose_spans_are_of_other_cameras_are_not_compared(tmp_path, capsys
         tokens = tokens_of(one, [small_prompt(one, "put the bowl on the plate", "1 2")])
         write_store(tmp_path / f"{name}.zarr", spec=StoreSpec(tokens=tokens))
     assert main(["compare", *(str(tmp_path / f"{name}.zarr") for name in "ab"), "--output", str(tmp_path / "c")]) == 2
-    assert "pooled keys 26-27 of camera front" in " ".join(capsys.readouterr().err.split())
+    assert "keys 26-27 of camera front" in " ".join(capsys.readouterr().err.split())
 
 
 def test_objects_of_a_camera_are_measured_on_all_its_patches(made):
@@ -321,7 +321,7 @@ def test_masks_of_a_picture_cover_the_patches_of_its_tiles(tmp_path):
     ],
 )
 def test_a_part_that_is_none_of_the_picture_is_refused(part):
-    with pytest.raises(BadArgument, match=r"expected \(top, left, height, width\) in fractions"):
+    with pytest.raises(BadArgument, match=r"\(top, left, height, width\)"):
         PatchGrid(2, 2, 8, 8, part)
     assert PatchGrid(2, 2, 8, 8, [0, 0, 1, 1]) == PatchGrid(2, 2, 8, 8)
     assert len({PatchGrid(2, 2, 8, 8, np.array([0, 0.5, 1, 0.5])), PatchGrid(2, 2, 8, 8, (0.0, 0.5, 1.0, 0.5))}) == 1
@@ -333,7 +333,7 @@ def test_a_map_of_several_grids_has_a_limited_number_of_cells():
         Span("a", "image", 0, keys, "front", PatchGrid(keys, 1, 1000, 1000)),
         Span("b", "image", keys, keys + 1, "front", PatchGrid(1, 1, 8, 8, (0.5, 0.5, 0.125, 0.125))),
     )
-    with pytest.raises(BadArgument, match="one size"):
+    with pytest.raises(BadArgument):
         SiteLayout("joint", spans)
     small = replace(spans[1], grid=PatchGrid(1, 1, 1000, 1000, (0.5, 0.5, 0.001, 0.001)))
     picture = PictureMap.of(SiteLayout("joint", (spans[0], small)), "front")
@@ -343,7 +343,7 @@ def test_a_map_of_several_grids_has_a_limited_number_of_cells():
 
 def test_grids_of_pictures_of_two_sizes_are_refused_in_one_site_and_in_two():
     small, large = (Span("a", "image", 0, 4, "front", PatchGrid(2, 2, side, side)) for side in (8, 16))
-    with pytest.raises(BadArgument, match=r"8 x 8, 16 x 16 pixels; expected one size.*part="):
+    with pytest.raises(BadArgument, match=r"8 x 8, 16 x 16 .*part="):
         SiteLayout("joint", (small, replace(large, name="b", start=4, stop=8)))
     sites = [RecordedSite(SiteLayout(*one), (0, 3), {"a": "image"}) for one in (("one", (small,)), ("two", (large,)))]
     with pytest.raises(BadArgument, match="8 x 8, 16 x 16 pixels"):
@@ -352,10 +352,10 @@ def test_grids_of_pictures_of_two_sizes_are_refused_in_one_site_and_in_two():
 
 def test_what_counts_patches_of_one_grid_refuses_several():
     sites = [SiteLayout("one", PARTS), SiteLayout("two", (Span("a", "image", 0, 4, "front", PatchGrid(2, 2, 8, 8)),))]
-    with pytest.raises(BadArgument, match="Sites have different patches of camera 'front'"):
+    with pytest.raises(BadArgument, match="'front'"):
         camera_grids(sites, "front")
     context = CallContext(0, 0, 0)
-    with pytest.raises(BadArgument, match="a shift needs one grid over the whole picture"):
+    with pytest.raises(BadArgument, match="grid"):
         changed_picture(np.zeros((8, 8, 3), np.uint8), ImageChange("front", "shifted", rows=1), sites[:1], context)
     patches = np.array([True, False, False, True])
     expected = np.kron(patches.reshape(2, 2), np.ones((4, 4), dtype=bool))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     checkpoint_format, prompt, normalisation = CHECKPOINTS[name]
 
     # the state does not fit into this model's 24 text slots: LeRobot cuts it, visibly
-    assert ("Warning: the prompt" in said.err) == (prompt == "task-state-action")
+    assert ("Warning" in said.err) == (prompt == "task-state-action")
 
     attributes = dict(zarr.open_group(store, mode="r").attrs)
     policy = attributes["policy"]
@@ -85,9 +86,8 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     capsys.readouterr()
     other = "openpi" if expected[0] == "lerobot" else "lerobot"
     resumed = ["--resume", "--protocol", other, "--seed", expected[1]]
-    assert f"its protocol.name is '{expected[0]}', this run's is '{other}'" in refused(
-        ["--checkpoint", GOLDEN / name, *arguments, *resumed], capsys
-    )
+    said = refused(["--checkpoint", GOLDEN / name, *arguments, *resumed], capsys)
+    assert re.search(f"protocol.name .*'{expected[0]}',.*'{other}'", said)
 
 
 def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):
@@ -118,16 +118,16 @@ TORCH, JAX, LEROBOT = "pi05_batch2/checkpoint_openpi_torch", "pi0_batch2/checkpo
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    ("arguments", "named"),
     [
-        (["--paligemma-variant", "gemma_300m"], "contradicts the policy"),
-        (["--config-name", "pi0_libero"], "tensors are not those of the model"),
-        (["--replan-steps", "8"], "expected 1 to 7"),
+        (["--paligemma-variant", "gemma_300m"], "gemma_300m"),
+        (["--config-name", "pi0_libero"], "tensors"),
+        (["--replan-steps", "8"], "1 to 7"),
     ],
 )
-def test_arguments_that_contradict_a_checkpoint(arguments, expected, small_tokenizer, tmp_path, capsys):
+def test_arguments_that_contradict_a_checkpoint(arguments, named, small_tokenizer, tmp_path, capsys):
     said = refused(
         ["--checkpoint", GOLDEN / JAX, "--tokenizer", small_tokenizer, "--output", tmp_path / "a.zarr", *arguments],
         capsys,
     )
-    assert expected in said
+    assert named in said

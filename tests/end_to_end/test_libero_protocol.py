@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -33,9 +34,7 @@ def test_a_resumed_episode_is_the_one_of_a_run_in_order(tmp_path: Path, libero_a
     shutil.copytree(in_order, resumed)
     shutil.rmtree(resumed / EPISODE)
     said = run(resumed, "--num-episodes", "3", "--resume")
-    assert (
-        "task000_episode002: the published furniture depends on the resets of earlier episodes; making 2 first." in said
-    )
+    assert re.search("task000_episode002: .* 2 first", said)
     ours, theirs = (zarr.open_group(store / EPISODE, mode="r") for store in (resumed, in_order))
     for name in (
         "frames/base_0_rgb",

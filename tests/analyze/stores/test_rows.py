@@ -54,7 +54,7 @@ def test_one_missing_value_in_one_head_is_an_error(tmp_path, per_head, queries):
     reseal(folder)
     store = open_store(path)
     selection = select(store.attributes, per_head=per_head)
-    with pytest.raises(CorruptEpisode, match="joint/rows of episode task000_episode000 has missing values"):
+    with pytest.raises(CorruptEpisode, match=r"joint/rows .*task000_episode000"):
         list(layer_rows(store.attributes, store.episodes[0], selection, "joint"))
     others = select(store.attributes, layers=[0], per_head=per_head)
     assert len(list(layer_rows(store.attributes, store.episodes[0], others, "joint"))) == 2
@@ -83,10 +83,9 @@ def test_a_row_of_another_sum_is_refused_by_its_place(tmp_path, queries, per_hea
     selection = select(store.attributes, heads=[1, 3], per_head=per_head)
     with pytest.raises(CorruptEpisode) as caught:
         list(layer_rows(store.attributes, store.episodes[0], selection, "joint"))
-    assert re.fullmatch(
-        r"Episode task000_episode000 is damaged: joint/rows does not add up to the row sums: they differ by up to "
-        r"0\.01 of them, allowed is 0\.0005, at replan 7, denoise step 0, layer 2, head 3"
-        r"(, query 0, and at 3 of 99 places in all)?\.",
+    assert re.search(
+        r"task000_episode000 .*joint/rows .*0\.01 .*0\.0005, at replan 7, denoise step 0, layer 2, head 3"
+        r"(, query 0, .* 3 of 99 .*)?\.$",
         str(caught.value),
     )
     for layers, denoise in (([0], None), ([2], ["last"])):
@@ -103,7 +102,7 @@ def test_commands_end_so_or_leave_the_episode_out(tmp_path, capsys):
         words += ["--no-plots", "--no-cache", "--output", out]
         assert main(words) == 2, words
         said = capsys.readouterr().err
-        assert "Episode task000_episode000 is damaged: joint/rows does not add up to the row sums" in said
+        assert re.search("task000_episode000 .*joint/rows", said)
         assert said.count("\n") == 1
     assert main([*asked[0], "--skip-corrupt"]) == 0
     assert "task000_episode000" in capsys.readouterr().out

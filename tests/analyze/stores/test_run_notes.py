@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -16,10 +17,10 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 
 SPEC = StoreSpec(tasks=(0,), episodes=3, plant_effects=planted_effects())
-#: A store's spec, and what must be said of it.
+#: A store's spec, and what must be named of it.
 KINDS = {
-    "cut": (SPEC, "the policy never read the end of its prompt ('and then the drawer')"),
-    "told": (replace(SPEC, plant_effects=None), "The prompt is not the task's instruction in 3 episodes"),
+    "cut": (SPEC, "('and then the drawer')"),
+    "told": (replace(SPEC, plant_effects=None), "instruction in 3 episodes"),
     "replaced": (replace(SPEC, interventions=Interventions("shuffled", prompt=PromptChange("shuffled"))), "shuffled"),
     "knocked out": (
         replace(SPEC, interventions=Interventions("blind", keys=(KeyKnockout("role:image"),))),
@@ -99,7 +100,7 @@ def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, comm
     assert (
         (expected in said)
         if expected
-        else ("Prompts were cut" not in said and "was changed" not in said and "The prompt is" not in said)
+        else ("and then the drawer" not in said and "instruction in 3 episodes" not in said)
     )
 
 
@@ -109,5 +110,5 @@ def test_the_page_opens_beside_a_damaged_episode(stores, tmp_path, monkeypatch, 
     (damaged / "episodes/task000_episode001/seal/zarr.json").write_text("no document")
     assert main(["view", str(damaged), "--no-open"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "The page: http" in said
-    assert f"in 2 episodes {KINDS['cut'][1]}" in said
+    assert "http" in said
+    assert re.search(r"in 2 episodes .*\('and then the drawer'\)", said)

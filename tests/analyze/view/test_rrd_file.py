@@ -36,7 +36,7 @@ def test_a_library_that_is_missing_or_too_old_is_named(tmp_path, capsys, monkeyp
         assert ("0.23.4" in said) == (library is not None)
     assert not (tmp_path / "a.rrd").exists()
     assert main(["view", str(store), "--rrd", str(tmp_path / "b.zarr")]) == 2
-    assert "named like a store" in capsys.readouterr().err
+    assert "b.zarr" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_a_word_with_a_capital_letter_has_its_effect():
 def test_a_full_disk_ends_it_and_leaves_nothing(tmp_path, store, rerun):
     view = [sys.executable, "-m", "vla_attention", "view", str(store), "--rrd", str(tmp_path / "a.rrd")]
     done = subprocess.run(["sh", "-c", 'ulimit -f 64; exec "$@"', "sh", *view], capture_output=True, text=True)
-    assert (done.returncode, "Cannot write recordings to" in done.stderr) == (2, True)
+    assert (done.returncode, str(tmp_path) in done.stderr) == (2, True)
     assert not [*tmp_path.iterdir()]
 
 

@@ -29,12 +29,12 @@ def test_items_and_readers_are_in_a_fixed_order():
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("words", "named"),
     [
-        (["--effects", "word"], "no item 'word'; expected text, cameras, objects, tokens"),
-        (["--effects-readers", "all", "text"], "--effects-readers without --effects"),
+        (["--effects", "word"], "'word'.* text, cameras, objects, tokens"),
+        (["--effects-readers", "all", "text"], "--effects-readers"),
     ],
 )
-def test_what_is_refused(words, sentence):
-    with pytest.raises(BadArgument, match=sentence):
+def test_what_is_refused(words, named):
+    with pytest.raises(BadArgument, match=named):
         settings(*words)

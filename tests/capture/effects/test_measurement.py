@@ -216,10 +216,10 @@ def test_numbers_that_are_not_finite_are_left_out(monkeypatch):
 
 def test_what_a_policy_has_not_is_refused():
 
-    with pytest.raises(BadArgument, match="no prefix"):
+    with pytest.raises(BadArgument, match="prefix"):
         planned_effects(EffectSettings(("text",), ("pictures",)), policy_named("cosmos"), 0)
 
-    with pytest.raises(BadArgument, match="beside interventions"):
+    with pytest.raises(BadArgument, match="interventions"):
         refuse_both(Interventions(keys=(KeyKnockout("role:image"),)))
     refuse_both(Interventions(prompt=PromptChange("empty")))
 

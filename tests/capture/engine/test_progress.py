@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from vla_attention.capture.engine.progress import describe_rest, duration, seconds_of_job
@@ -14,11 +16,9 @@ def test_durations_have_the_unit_that_fits(seconds: float, text: str):
 
 def test_time_and_disk_are_those_of_the_first_episode_times_what_is_left():
     line = describe_rest(60, 2_000_000, 0.5, left=40, at_a_time=4, room=10**9, job_seconds=None)
-    assert "took 60 s and 2 MB" in line
-    assert "about 10 min (at most 20 min" in line
-    assert "about 80 MB (at most 160 MB) of 1 GB" in line
+    assert re.search(r"\b60 s .*\b2 MB.*\b10 min .*\b20 min.*\b80 MB .*\b160 MB.*\b1 GB", line)
     assert "job" not in line
-    assert "at most" not in describe_rest(60, 2_000_000, 1.0, 40, 4, 10**9, None)
+    assert "20 min" not in describe_rest(60, 2_000_000, 1.0, 40, 4, 10**9, None)
 
 
 @pytest.mark.parametrize(

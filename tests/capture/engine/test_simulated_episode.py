@@ -214,21 +214,22 @@ def test_a_replan_is_stored_with_its_rows_and_coverage(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("segmentation", "message"),
+    ("segmentation", "numbers"),
     [
-        (np.zeros((2, 4), dtype=np.int32), r"shape \(2, 4\) and type int32; expected whole numbers .* \(4, 2\) pixels"),
-        (np.full((4, 2), 2, dtype=np.int32), "holds indices 2 to 2; with 2 objects, 0 to 1 are valid"),
+        (np.zeros((2, 4), dtype=np.int32), r"\(2, 4\) .*int32; .* \(4, 2\)"),
+        (np.full((4, 2), 2, dtype=np.int32), "2 to 2; .*2 objects, 0 to 1"),
     ],
 )
-def test_a_segmentation_that_does_not_fit_its_picture_is_refused(monkeypatch, segmentation, message) -> None:
+def test_a_segmentation_that_does_not_fit_its_picture_is_refused(monkeypatch, segmentation, numbers) -> None:
     environment = FakeEnvironment()
     environment.segmentation = lambda camera: segmentation
-    with pytest.raises(BadArgument, match=message) as caught:
+    with pytest.raises(BadArgument, match=numbers) as caught:
         run_episode(monkeypatch, environment, FakeStore(), index=2)
-    assert str(caught.value).startswith(
-        "Cannot store replan 0 (environment step 10) of episode task003_episode002 of runs/made_up.zarr, "
-        "camera 'agentview': "
-    )
+    assert [
+        name
+        for name in ("replan 0", "step 10", "task003_episode002", "runs/made_up.zarr", "'agentview'")
+        if name not in str(caught.value)
+    ] == []
 
 
 def test_the_check_is_made_before_every_step(monkeypatch) -> None:
@@ -243,8 +244,8 @@ def test_the_check_is_made_before_every_step(monkeypatch) -> None:
     assert len(environment.actions) == 12
 
 
-@pytest.mark.parametrize(("replan_steps", "max_steps", "message"), [(5, 8, "expected 1 to 4"), (4, 0, "at least 1")])
-def test_a_policy_must_be_able_to_follow_the_protocol(replan_steps: int, max_steps: int, message: str) -> None:
+@pytest.mark.parametrize(("replan_steps", "max_steps", "numbers"), [(5, 8, "1 to 4"), (4, 0, " 1")])
+def test_a_policy_must_be_able_to_follow_the_protocol(replan_steps: int, max_steps: int, numbers: str) -> None:
     protocol = Protocol(
         suite="made_up",
         seed=7,
@@ -254,7 +255,7 @@ def test_a_policy_must_be_able_to_follow_the_protocol(replan_steps: int, max_ste
         name="openpi",
         image_size=4,
     )
-    with pytest.raises(BadArgument, match=message):
+    with pytest.raises(BadArgument, match=numbers):
         check_protocol(protocol, FakePolicy())
 
 

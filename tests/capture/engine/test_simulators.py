@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -69,9 +70,9 @@ def test_more_simulators_give_the_same_episodes(scene, tmp_path, capsys):
     assert len(ThreadOfTests.started) == 3
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "three.zarr")
     printed = capsys.readouterr().out
-    assert "Simulators: 3 processes; --num-envs N changes it." in printed
-    assert printed.count("no success after 8 steps, 2 replans") == 6
-    assert "6 episodes added, 0 solved." in printed
+    assert re.search("3 processes; --num-envs", printed)
+    assert len(re.findall("no success .*8 steps, 2 replans", printed)) == 6
+    assert "6 episodes added, 0 solved" in printed
     assert not (tmp_path / "three.zarr" / ".writing").exists()
     assert store_status(tmp_path / "three.zarr").complete
     assert analyze(["store", "verify", str(tmp_path / "three.zarr")]) == 0
@@ -85,8 +86,7 @@ def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
     assert record(tmp_path / "a.zarr", 2, *words) == 0
     assert Deadly.lives == [0]
     assert len(ThreadOfTests.started) == 4
-    again = "task000_episode001: its simulator ended (killed by signal 9); the episode begins again."
-    assert capsys.readouterr().out.count(again) == 2
+    assert len(re.findall(r"task000_episode001: .*signal 9\)", capsys.readouterr().out)) == 2
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr" / ".writing").exists()
 
@@ -100,22 +100,13 @@ class Broken(StillScene):
         raise self.error
 
 
-@pytest.mark.parametrize(
-    ("error", "said"),
-    [
-        (
-            RuntimeError("the context\nis lost"),
-            "of .*a.zarr failed: the context is lost (RuntimeError, test_simulators.py:",
-        )
-    ],
-)
-def test_an_error_of_a_simulator_is_one_sentence(scene, tmp_path, capsys, error, said):
-    Broken.error = error
+def test_an_error_of_a_simulator_is_one_line(scene, tmp_path, capsys):
+    Broken.error = RuntimeError("the context\nis lost")
     scene.make = Broken
     assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2") == 2
     printed = capsys.readouterr().err
     assert printed.count("\n") == 1
-    for part in said.split(".*"):
+    for part in ("a.zarr", "the context is lost", "RuntimeError", "test_simulators.py:"):
         assert part in printed
     assert "Traceback" not in printed
 
@@ -128,7 +119,6 @@ def test_an_error_of_the_writing_ends_everything(scene, tmp_path, monkeypatch, c
     assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2") == 2
     said = capsys.readouterr().err
     assert "No space left on device" in said
-    assert "Nothing of this episode was kept" in said
     assert said.count("\n") == 1
     assert not (tmp_path / "a.zarr" / ".writing").exists()
 
@@ -144,7 +134,7 @@ def test_it_waits_for_an_episode_that_another_process_has_locked(scene, tmp_path
     )
     assert record(store, 2, "--task-id", "0", "--num-episodes", "4", "--resume") == 0
     printed = capsys.readouterr().out
-    assert printed.count("Waiting for episodes that other processes are writing: task000_episode001 by node7") == 1
+    assert printed.count("task000_episode001 by node7") == 1
     assert printed.index("episode 3: no success") < printed.index("Waiting") < printed.index("episode 1: no success")
     assert store_status(store).complete
 
@@ -176,7 +166,7 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
     capsys.readouterr()
     sizes = in_whole_batches(monkeypatch)
     assert record(tmp_path / "four.zarr", 4, "--policy-batch", "3", *words) == 0
-    assert "Policy calls in batches of at most 3; --policy-batch N changes it." in capsys.readouterr().out
+    assert re.search("at most 3; --policy-batch", capsys.readouterr().out)
     assert sizes[0] == 3
     assert sum(sizes) == 8 + 3  # three single calls look at whether the words get through
     given = {kind: open_store(tmp_path / f"{kind}.zarr").episodes[0].attributes.provenance for kind in ("one", "four")}
@@ -287,9 +277,8 @@ def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, t
     if number != signal.SIGKILL:
         assert not (run.store / ".writing").exists()
     if number == signal.SIGTERM:
-        assert "Stopped by SIGTERM: dropped task000_episode000 at step" in said
-        assert ", task000_episode001 at step" in said
-        assert "3 of this process's 3 are missing" in said
+        assert re.search("SIGTERM: .*task000_episode000 at step.*, task000_episode001 at step", said)
+        assert "3 of this process's 3" in said
     assert not any((run.store / "episodes").glob("task*"))
 
 
@@ -305,7 +294,7 @@ def test_a_killed_simulator_is_replaced(tmp_path):
     assert len(folders) == 2
     os.kill(victim, signal.SIGKILL)
     assert run.process.wait(600) == 0, run.log.read_text()
-    assert run.log.read_text().count("its simulator ended (killed by signal 9); the episode begins again.") == 1
+    assert len(re.findall("signal 9.* begins again", run.log.read_text())) == 1
     assert store_status(run.store).complete
     assert analyze(["store", "verify", str(run.store)]) == 0
     assert list(run.temporary.glob("vla-*")) == []

@@ -65,7 +65,7 @@ def test_some_of_the_five_wheels_are_none(no_assets: Path, monkeypatch: pytest.M
         (no_assets / "site" / "two_wheels" / f"part_{part}.py").touch()
     monkeypatch.syspath_prepend(no_assets / "site")
     monkeypatch.setattr(libero_assets, "_WHEELS", "two_wheels")
-    with pytest.raises(LiberoAssetsMissing, match=r"assets-2, \S+assets-3, \S+assets-5 are not installed"):
+    with pytest.raises(LiberoAssetsMissing, match=r"assets-2, \S+assets-3, \S+assets-5 "):
         find_assets(None)
 
 

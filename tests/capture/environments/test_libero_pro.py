@@ -79,18 +79,18 @@ def _objects(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "named"),
     [
-        (_objects, "initial states of 'turn_on_the_stove' in libero_pro_goal_lan are no numbers"),
-        (lambda folder: (folder / "turn_on_the_stove.npy").write_bytes(b"no array"), "are no numbers"),
-        (lambda folder: (folder / "turn_on_the_stove.npy").unlink(), "lacks 'turn_on_the_stove.npy'"),
-        (lambda folder: (folder / "turn_on_the_stove.bddl").write_text("(define)"), "has no sentence"),
-        (shutil.rmtree, "lacks 'open_the_middle_drawer_of_the_cabinet.bddl' of libero_pro_goal_lan"),
+        (_objects, "'turn_on_the_stove' in libero_pro_goal_lan"),
+        (lambda folder: (folder / "turn_on_the_stove.npy").write_bytes(b"no array"), "'turn_on_the_stove'"),
+        (lambda folder: (folder / "turn_on_the_stove.npy").unlink(), "'turn_on_the_stove.npy'"),
+        (lambda folder: (folder / "turn_on_the_stove.bddl").write_text("(define)"), "turn_on_the_stove"),
+        (shutil.rmtree, "'open_the_middle_drawer_of_the_cabinet.bddl' .*libero_pro_goal_lan"),
     ],
 )
-def test_damaged_content_is_refused(tmp_path, monkeypatch, change, said):
+def test_damaged_content_is_refused(tmp_path, monkeypatch, change, named):
     monkeypatch.setattr(libero_pro, "_ARCHIVE", _with(tmp_path, change))
-    with pytest.raises(UnusableLiberoPro, match=said):
+    with pytest.raises(UnusableLiberoPro, match=named):
         pro_initial_states(list_tasks(find_suite("libero_goal_lan"))[7])
 
 
@@ -98,13 +98,13 @@ def test_damaged_content_is_refused(tmp_path, monkeypatch, change, said):
 def test_a_damaged_archive_is_refused(tmp_path, monkeypatch, content):
     (tmp_path / "cut.tar.xz").write_bytes(content)
     monkeypatch.setattr(libero_pro, "_ARCHIVE", tmp_path / "cut.tar.xz")
-    with pytest.raises(UnusableLiberoPro, match=r"cannot be read .* install it again"):
+    with pytest.raises(UnusableLiberoPro, match=r"cut.tar.xz"):
         list_tasks(find_suite("libero_pro_goal_lan"))
 
 
 def test_assets_without_its_objects_are_refused(tmp_path):
     assert libero_pro.check_pro_assets("libero_pro_goal_swap", tmp_path) == tmp_path
-    with pytest.raises(LiberoAssetsMissing, match=r"lack bigger_akita_black_bowl.* then leave out --libero-assets"):
+    with pytest.raises(LiberoAssetsMissing, match=r"bigger_akita_black_bowl.*--libero-assets"):
         libero_pro.check_pro_assets("libero_pro_goal_object", tmp_path)
 
 

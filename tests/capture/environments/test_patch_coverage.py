@@ -84,5 +84,5 @@ def test_rows_alone_can_be_reversed_and_only_the_middle_seen():
     flipped = patch_coverage(segmentation, 3, 4, 4, flip_rows=True, flip_columns=False, visible=0.5)
     assert flipped[:12].tolist() == [[1, 0, 0]] * 12
     assert flipped[12:].tolist() == [[0, 0, 1]] * 4
-    with pytest.raises(BadArgument, match="visible share"):
+    with pytest.raises(BadArgument, match="visible"):
         patch_coverage(segmentation, 3, 4, 4, **STRAIGHT, visible=0.0)

@@ -30,7 +30,7 @@ def test_published_protocol_numbers() -> None:
 
 
 def test_unknown_suite_names_the_nearest() -> None:
-    with pytest.raises(UnknownName, match=r"Unknown task suite 'libero_spacial'. Did you mean 'libero_spatial'\?"):
+    with pytest.raises(UnknownName, match=r"'libero_spacial'.*'libero_spatial'"):
         find_suite("libero_spacial")
 
 
@@ -38,7 +38,7 @@ def test_task_id_out_of_range_states_the_range() -> None:
     suite = find_suite("libero_goal")
     check_task_id(suite, 9)
     for task_id in (-1, 10):
-        with pytest.raises(BadArgument, match=f"Task {task_id} does not exist in libero_goal; its tasks are 0 to 9"):
+        with pytest.raises(BadArgument, match=f"Task {task_id} .*libero_goal; .* 0 to 9"):
             check_task_id(suite, task_id)
     with pytest.raises(BadArgument, match="Task 8"):
         make_environment(find_suite("robosuite"), 8, SETTINGS)

@@ -28,7 +28,7 @@ def test_a_link_out_of_the_folder_is_the_user_s_only_where_it_was_named(file, tm
         lambda: check_regular(link, BadArgument, inside=link.parent),
         lambda: check_folder(link.parent, BadArgument),
     ):
-        with pytest.raises(BadArgument, match="leads out of its folder"):
+        with pytest.raises(BadArgument, match=r"/link' .*/file'"):
             check()
     check_folder(link.parent, BadArgument, inside=False)
 
@@ -42,7 +42,7 @@ def test_the_hub_s_cache_has_links_to_blobs_of_the_same_repository(tmp_path):
     (snapshot / "own").symlink_to("../../../blobs/1")
     (snapshot / "other").symlink_to("../../../../models--c--d/blobs/1")
     assert check_regular(snapshot / "own", BadArgument, inside=snapshot) == 1
-    with pytest.raises(BadArgument, match="leads out"):
+    with pytest.raises(BadArgument, match="other"):
         check_regular(snapshot / "other", BadArgument, inside=snapshot)
 
 
@@ -51,7 +51,7 @@ def test_what_is_no_file(file, tmp_path):
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(tmp_path / "socket"))
         for name in ("pipe", "socket", "folder"):
-            with pytest.raises(BadArgument, match="no regular file"):
+            with pytest.raises(BadArgument, match=name):
                 check_regular(tmp_path / name, BadArgument)
     with pytest.raises(FileNotFoundError):
         check_regular(tmp_path / "nothing", BadArgument)

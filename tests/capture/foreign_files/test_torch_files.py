@@ -41,7 +41,7 @@ def test_transformer_engine_s_extra_state_is_read(tmp_path):
     found = read_tensors(tmp_path / "a.pt")
     assert torch.equal(found["net.a"], torch.ones(2))
     assert found["net.a._extra_state"].getvalue() == b"\xff\x00" * 100
-    with pytest.raises(BadArgument, match=r"a.pt' was refused: it asks for _?io.BytesIO.*nothing of it was executed"):
+    with pytest.raises(BadArgument, match=r"a\.pt' .*_?io\.BytesIO"):
         load_torch(tmp_path / "a.pt", BadArgument)
 
 
@@ -62,7 +62,7 @@ def test_initial_states_of_libero_are_read(tmp_path):
 
 def test_files_before_pytorch_1_6_are_refused(tmp_path):
     torch.save({"a": torch.ones(2)}, tmp_path / "a.pt", _use_new_zipfile_serialization=False)
-    with pytest.raises(BadArgument, match=r"a.pt' cannot be read as a file of torch.save .* from its source"):
+    with pytest.raises(BadArgument, match=r"a\.pt'"):
         load_torch(tmp_path / "a.pt", BadArgument)
 
 

@@ -79,11 +79,11 @@ def test_an_objects_patches_are_those_that_show_some_of_it(given, kind):
 
 
 def test_names_that_do_not_exist(given):
-    with pytest.raises(UnknownName, match="Unknown camera 'bass'"):
+    with pytest.raises(UnknownName, match="'bass'"):
         changed_inputs(given, image("bass", "blank"), SITES, context())
-    with pytest.raises(UnknownName, match="Unknown object 'cub'"):
+    with pytest.raises(UnknownName, match="'cub'"):
         changed_inputs(given, image("base", "masked", object="cub"), SITES, context())
-    with pytest.raises(BadArgument, match="Cannot find the patches of 'cube' in camera 'wrist'"):
+    with pytest.raises(BadArgument, match=r"'cube' .*'wrist'"):
         changed_inputs(given, image("wrist", "filled", object="cube"), SITES, context())
 
 

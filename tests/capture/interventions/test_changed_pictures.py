@@ -42,7 +42,7 @@ def test_shifts_are_whole_patches_and_repeat_the_edge(picture):
     np.testing.assert_array_equal(moved[8:, 16:], np.repeat(picture[:24, -1:], 16, axis=1))
     np.testing.assert_array_equal(changed_inputs.shifted(picture, GRID, 0, 0), picture)
     for rows, columns in ((4, 0), (0, -4)):
-        with pytest.raises(BadArgument, match="leaves nothing of a picture of 4 x 4 patches"):
+        with pytest.raises(BadArgument, match="4 x 4"):
             changed_inputs.shifted(picture, GRID, rows, columns)
 
 

@@ -95,13 +95,13 @@ def test_noise():
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "named"),
     [
-        (["--random-keys", "0"], "--random-keys has nothing to act on; give --knockout or --keep too"),
-        (["--allow-empty"], "--allow-empty has nothing to act on"),
+        (["--random-keys", "0"], "--random-keys .*--knockout"),
+        (["--allow-empty"], "--allow-empty"),
         (["--prompt", "task:²"], "'task:²'"),
     ],
 )
-def test_mistakes(words, message):
-    with pytest.raises(UserError, match=message):
+def test_mistakes(words, named):
+    with pytest.raises(UserError, match=named):
         read(*words)

@@ -100,15 +100,15 @@ def test_resumed_runs_apply_them_bit_for_bit_and_others_are_refused(tmp_path, ca
     capsys.readouterr()
     for words in ((), CHANGES, (*CHANGES, "--random-keys", "4")):
         assert run(path, "--task-id", "0", "1", *words, "--resume") == 2
-        assert f"Cannot resume {path}: its interventions." in capsys.readouterr().err
+        assert f"{path}: its interventions." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (("--knockout", "camera:bas"), "Did you mean 'base_0_rgb'?"),
-        (("--knockout", "word:lift", "--knockout-layers", "9"), "expected block indices 0 to 2"),
-        (("--knockout", "word:lift", "--knockout-queries", "all", "--knockout-steps", "1"), "runs once before all of"),
+        (("--knockout", "camera:bas"), "'base_0_rgb'"),
+        (("--knockout", "word:lift", "--knockout-layers", "9"), "0 to 2"),
+        (("--knockout", "word:lift", "--knockout-queries", "all", "--knockout-steps", "1"), "prefix"),
     ],
 )
 def test_mistakes_are_found_before_anything_is_written(tmp_path, capsys, words, expected):

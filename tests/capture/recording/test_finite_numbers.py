@@ -89,11 +89,8 @@ def test_a_policy_that_overflows_is_reported_with_its_first_layer(
     assert "Traceback" not in said.err
     assert said.err.count("\n") == 1
     step = 4 * replan  # actions of a chunk that are executed
-    assert (
-        f"turned NaN or infinite at replan {replan} (environment step {10 + step}) of episode task000_episode001"
-        in said.err
-    )
-    assert f"They begin {where}, in the output of {'dit.' * (family == 'cosmos')}{module}. " in said.err
+    assert f"replan {replan} (environment step {10 + step}) of episode task000_episode001" in said.err
+    assert f"{where}, in the output of {'dit.' * (family == 'cosmos')}{module}. " in said.err
     (episode,) = open_store(store).episodes
     assert episode.name == "task000_episode000"
     assert verify_store(open_store(store)) == []
@@ -115,10 +112,7 @@ def test_a_checkpoint_with_nan_names_the_tensor_and_makes_no_store(tmp_path, mon
     tokenizer = train_small_tokenizer(tmp_path / "small.model")
     assert capture(["pi", "--checkpoint", str(checkpoint), "--tokenizer", str(tokenizer), "--output", str(store)]) == 2
     said = capsys.readouterr().err
-    assert (
-        f"NaN or infinite weights in 2 tensors: action_out_proj.bias (1 of {len(tensors['action_out_proj.bias'])}"
-        in said
-    )
+    assert f"2 tensors: action_out_proj.bias (1 of {len(tensors['action_out_proj.bias'])}" in said
     assert f"{name} (3 of " in said
     assert said.count("\n") == 1
     assert not store.exists()
@@ -131,5 +125,5 @@ def test_one_number_is_enough(dtype, value):
     assert len(weights_digest(layer)) == 64
     with torch.no_grad():
         layer.weight[3, 299] = value
-    with pytest.raises(WeightsNotFinite, match=r"1 tensors: weight \(1 of 2100 numbers\)"):
+    with pytest.raises(WeightsNotFinite, match=r"\b1 tensors: weight \(1 of 2100 "):
         weights_digest(layer)

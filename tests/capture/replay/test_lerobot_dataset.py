@@ -55,7 +55,7 @@ def test_every_nth_frame_of_chosen_cameras(tmp_path, version):
     assert [frame.index for frame in frames] == [0, 17, 34]
     assert [number_of(frame.images[CAMERAS[1]]) for frame in frames] == [150, 167, 184]
     assert all(list(frame.images) == [CAMERAS[1]] for frame in frames)
-    with pytest.raises(BadArgument, match="every 0th"):
+    with pytest.raises(BadArgument, match="0th"):
         next(data.episode(1).frames(every=0))
 
 
@@ -94,7 +94,7 @@ def test_whole_numbers_of_tables_may_be_stored_as_floats(tmp_path):
     data = open_dataset(folder)
     assert [number_of(frame.images[CAMERAS[0]]) for frame in data.episode(1).frames()] == [100, 101, 102, 103]
     rows.with_columns(pl.lit(0.5).alias("data/file_index")).write_parquet(path)
-    with pytest.raises(DamagedDataSet, match="a whole number in the column 'data/file_index'"):
+    with pytest.raises(DamagedDataSet, match="'data/file_index'"):
         open_dataset(folder)
 
 
@@ -103,10 +103,10 @@ def test_rows_of_an_episode_follow_one_another(tmp_path):
     (table,) = folder.glob("data/**/*.parquet")
     rows = pl.read_parquet(table)
     rows[[0, 3, 1, 2, 4, 5, 6]].write_parquet(table)
-    with pytest.raises(DamagedDataSet, match=r"has 4 rows .* frames 0 to 2, one after the other"):
+    with pytest.raises(DamagedDataSet, match=r"4 rows .* 0 to 2"):
         open_dataset(folder).episode(0)
     rows[[1, 0, 2, 3, 4, 5, 6]].write_parquet(table)
-    with pytest.raises(DamagedDataSet, match=r"has 3 rows .* frames 0 to 2, one after the other"):
+    with pytest.raises(DamagedDataSet, match=r"3 rows .* 0 to 2"):
         open_dataset(folder).episode(0)
 
 
@@ -116,7 +116,7 @@ def edit_info(folder, **changes):
 
 
 def test_what_is_no_data_set_is_said(tmp_path):
-    with pytest.raises(DataSetNotFound, match=r"no data set at .*give a folder, or ORG/NAME"):
+    with pytest.raises(DataSetNotFound, match=r"nothing/at/all"):
         open_dataset(tmp_path / "nothing" / "at" / "all")
 
 
@@ -124,7 +124,7 @@ def test_what_is_no_data_set_is_said(tmp_path):
 def test_another_version_is_refused_with_those_that_are_read(tmp_path, version):
     folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
     edit_info(folder, codebase_version=version)
-    with pytest.raises(UnsupportedDataSet, match=r"this program reads v2.0, v2.1, v3.0"):
+    with pytest.raises(UnsupportedDataSet, match=r"v2\.0, v2\.1, v3\.0"):
         open_dataset(folder)
 
 
@@ -140,14 +140,14 @@ def test_a_path_template_stays_inside_of_the_data_set(tmp_path, template):
 def test_an_unknown_episode_and_missing_files_are_said(tmp_path, version):
     folder = write_data_set(tmp_path / "robot", version, made_up_episodes((3, 4, 3)), video=H264)
     data = open_dataset(folder)
-    with pytest.raises(UnknownName, match=r"no episode 3; its episodes are 0 to 2"):
+    with pytest.raises(UnknownName, match=r"\b3; .* 0 to 2"):
         data.episode(3)
     videos = sorted(folder.glob("videos/**/*.mp4"))
     videos[-1].unlink()
     data.check_files([0], data.cameras)
-    with pytest.raises(DataSetNotFound, match=r"lacks 1 of the files .*mp4"):
+    with pytest.raises(DataSetNotFound, match=r"\b1 of .*mp4"):
         data.check_files([0, 2], data.cameras)
-    with pytest.raises(DataSetNotFound, match="no video"):
+    with pytest.raises(DataSetNotFound, match="video"):
         list(data.episode(2).frames())
     for table in folder.glob("data/**/*.parquet"):
         table.unlink()
@@ -160,13 +160,13 @@ def test_rows_that_contradict_the_meta_files_are_refused(tmp_path):
     table = next(folder.glob("data/**/*.parquet"))
     rows = pl.read_parquet(table)
     rows.head(3).write_parquet(table)
-    with pytest.raises(DamagedDataSet, match=r"has 3 rows .*frames 0 to 3"):
+    with pytest.raises(DamagedDataSet, match=r"3 rows .* 0 to 3"):
         open_dataset(folder).episode(0)
     rows.with_columns(pl.lit(7).alias("task_index")).write_parquet(table)
     with pytest.raises(DamagedDataSet, match="task 7"):
         open_dataset(folder).episode(0)
     table.write_bytes(b"no table")
-    with pytest.raises(DamagedDataSet, match="cannot be read"):
+    with pytest.raises(DamagedDataSet, match=r"\.parquet"):
         open_dataset(folder).episode(0)
 
 
@@ -174,7 +174,7 @@ def test_rows_that_contradict_the_meta_files_are_refused(tmp_path):
 def test_a_frame_rate_that_contradicts_the_time_stamps_is_refused(tmp_path, fps):
     info = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((4, 3)), fps=10) / "meta" / "info.json"
     info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": fps}))
-    with pytest.raises(DamagedDataSet, match=r"are 0.1 s apart \(10 frames per second\), .* says fps"):
+    with pytest.raises(DamagedDataSet, match=r"0\.1 s .*\(10 frames per second\), .* fps"):
         open_dataset(tmp_path / "robot").episode(1)
 
 
@@ -191,9 +191,9 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path):
     episode = made_up_episodes((4,))[0]
     episode.columns["action"][2, 1] = np.nan
     data = open_dataset(write_data_set(tmp_path / "robot", "v3.0", [episode]))
-    with pytest.raises(DamagedDataSet, match=r"'action' of episode 0 .* first at frame 2"):
+    with pytest.raises(DamagedDataSet, match=r"'action' of episode 0 .* frame 2"):
         data.episode(0).column("action")
-    with pytest.raises(UnknownName, match=r"Did you mean 'action'\?"):
+    with pytest.raises(UnknownName, match="'action'"):
         data.episode(0).column("actions")
 
 
@@ -202,7 +202,7 @@ def test_numbers_of_episodes_that_cannot_be_are_refused(tmp_path, index, length)
     folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
     line = {"episode_index": index, "length": length, "tasks": []}
     (folder / "meta" / "episodes.jsonl").write_text(json.dumps(line))
-    with pytest.raises(DamagedDataSet, match=r"expected at least one frame|has 3 rows"):
+    with pytest.raises(DamagedDataSet, match=r"one frame|3 rows"):
         open_dataset(folder).episode(0)
 
 
@@ -211,7 +211,7 @@ def test_a_video_that_is_shorter_than_its_table_is_refused(tmp_path):
 
     folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((6,)), video=H264)
     write_video(next(folder.glob("videos/**/*.mp4")), [numbered_picture(i) for i in range(5)], 10, H264)
-    with pytest.raises(DamagedDataSet, match=r"no picture at 0.5000 s: its 5 pictures are at 0.0000 to 0.4000 s"):
+    with pytest.raises(DamagedDataSet, match=r"0\.5000 s: .* 5 .* 0\.0000 to 0\.4000 s"):
         list(open_dataset(folder).episode(0).frames())
 
 
@@ -219,14 +219,14 @@ def test_a_damaged_video_and_a_damaged_picture_are_refused(tmp_path):
     folder = write_data_set(tmp_path / "video", "v2.1", made_up_episodes((6,)), video=H264)
     video = next(folder.glob("videos/**/*.mp4"))
     video.write_bytes(b"no video at all")
-    with pytest.raises(UndecodableVideo, match="no video that can be read"):
+    with pytest.raises(UndecodableVideo, match=r"\.mp4"):
         list(open_dataset(folder).episode(0).frames())
     folder = write_data_set(tmp_path / "png", "v2.1", made_up_episodes((2,)))
     table = next(folder.glob("data/**/*.parquet"))
     cell = {"bytes": b"no picture", "path": None}
     kind = pl.Struct({"bytes": pl.Binary, "path": pl.String})
     pl.read_parquet(table).with_columns(pl.Series(CAMERAS[0], [cell, cell], dtype=kind)).write_parquet(table)
-    with pytest.raises(DamagedDataSet, match="cannot be decoded"):
+    with pytest.raises(DamagedDataSet, match=f"'{CAMERAS[0]}' in episode 0 of 'png'"):
         list(open_dataset(folder).episode(0).frames())
 
 
@@ -247,7 +247,7 @@ def test_pictures_may_be_files_of_the_data_set_and_no_others(tmp_path):
     for place in ("../outside.png", str(tmp_path / "outside.png"), ""):
         cells = [{"bytes": None, "path": place}] * 2
         rows.with_columns(pl.Series(CAMERAS[0], cells, dtype=kind)).write_parquet(table)
-        with pytest.raises(DataSetNotFound, match="neither in its table nor in a file"):
+        with pytest.raises(DataSetNotFound):
             list(open_dataset(folder).episode(0).frames())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -96,24 +97,24 @@ def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
     options = ("replay", data, "--policy", file, "--output", store, "--layers", 0, 2, "--queries", "all")
     assert run(*options, "--episode", 2) == 0
     assert run(*options, "--resume") == 0
-    assert "1 of 3 episodes are complete already; 2 to run." in capsys.readouterr().out
+    assert re.search("1 of 3 .* 2 to run", capsys.readouterr().out)
     episode = zarr.open_group(store / "episodes" / "task000_episode002", mode="r")
     assert episode["joint"].attrs["layer"] == [0, 2]
     assert episode["joint/rows"].shape[4] == HORIZON
     assert run(*options, "--resume", "--every", 1) == 2
-    assert "replan_steps is 2, this run's is 1" in capsys.readouterr().err
+    assert re.search("replan_steps .*2,.* 1", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize(
-    ("content", "options", "message"),
+    ("content", "options", "named"),
     [
-        (None, (), "there is no such file"),
-        ("def load(device): return 3", (), "returned a int, not a va.datasets.ReplayPolicy"),
-        (FILE, ("--camera", "top=front"), "Unknown camera of the policy 'top'"),
+        (None, (), "my_policy.py"),
+        ("def load(device): return 3", (), "va.datasets.ReplayPolicy"),
+        (FILE, ("--camera", "top=front"), "'top'"),
         (FILE, ("--knockout", "camera:top"), "top"),
     ],
 )
-def test_mistakes_end_with_one_sentence(tmp_path, data, capsys, content, options, message):
+def test_mistakes_are_named(tmp_path, data, capsys, content, options, named):
     file = tmp_path / "my_policy.py"
     if content is not None:
         file.write_text(content)
@@ -123,5 +124,5 @@ def test_mistakes_end_with_one_sentence(tmp_path, data, capsys, content, options
         code = end.code
     assert code == 2
     error = capsys.readouterr().err
-    assert message in error
+    assert named in error
     assert "Traceback" not in error

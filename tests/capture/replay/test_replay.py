@@ -127,20 +127,20 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     # with --resume, what is missing is added
     shutil.rmtree(store / "episodes" / "task000_episode002")
     assert run("status", store, "--check") == 1
-    assert "missing: task 0 lacks 1 of 1 episodes: 2" in capsys.readouterr().out
+    assert re.search("task 0 .*1 of 1 .*: 2", capsys.readouterr().out)
     assert run("replay", data, *options, "--resume") == 0
-    assert "1 of 3 episodes are complete already; 2 to run" in capsys.readouterr().out
+    assert re.search("1 of 3 .* 2 to run", capsys.readouterr().out)
     assert run("status", store, "--check") == 0
-    assert "complete: the store has every expected episode." in capsys.readouterr().out
+    assert "missing" not in capsys.readouterr().out
     assert sorted(path.name for path in (store / "episodes").glob("task*")) == [
         "task000_episode000",
         "task000_episode002",
         "task001_episode001",
     ]
     assert run("replay", data, *options) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert str(store) in capsys.readouterr().err
     assert run("replay", data, *TINY, *cameras, "--every", 2, "--output", store, "--resume") == 2
-    assert "protocol.replan_steps is 3, this run's is 2" in capsys.readouterr().err
+    assert re.search(r"protocol\.replan_steps .*3,.* 2", capsys.readouterr().err)
     assert analyze(["store", "verify", str(store)]) == 0
 
 
@@ -175,21 +175,21 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "named"),
     [
-        (["--episode", 3], "has no episode 3; its episodes are 0 to 2"),
-        (["--camera", "base=image"], "Unknown camera of the policy 'base'. Did you mean 'base_0_rgb'?"),
-        (["--camera", "base_0_rgb=front"], "Unknown camera of the data set 'data' 'front'"),
-        (["--policy", "smolvla"], "Cannot use --policy smolvla; expected pi"),
+        (["--episode", 3], r"\b3; .* 0 to 2"),
+        (["--camera", "base=image"], "'base'.*'base_0_rgb'"),
+        (["--camera", "base_0_rgb=front"], "'data' 'front'"),
+        (["--policy", "smolvla"], "--policy smolvla; .*pi"),
     ],
 )
-def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, options, message):
+def test_mistakes_end_with_one_line(tmp_path, capsys, monkeypatch, options, named):
     monkeypatch.chdir(tmp_path)
     made = made_up_episodes((3, 3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
     data = write_data_set(tmp_path / "data", "v2.1", made)
     assert run("replay", data, *TINY, "--output", "replay.zarr", *options) == 2
     error = capsys.readouterr().err
-    assert message in error
+    assert re.search(named, error)
     assert error.startswith("vla-capture: ")
     assert "Traceback" not in error
     assert not list(tmp_path.rglob("*.zarr"))
@@ -200,9 +200,7 @@ def test_a_checkpoint_of_another_robot_is_refused(tmp_path, capsys, tokenizer):
     data = write_data_set(tmp_path / "data", "v2.1", made)
     store = ("--tokenizer", tokenizer, "--output", tmp_path / "replay.zarr")
     assert run("replay", data, "--checkpoint", GOLDEN / "pi05_batch2/checkpoint_openpi_torch", *store) == 2
-    assert (
-        "states have 8 numbers, and those of the data set 'data' 14: observation.state (14)" in capsys.readouterr().err
-    )
+    assert re.search(r"\b8 .*'data' 14: observation\.state \(14\)", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("name", ["table: a billion rows in a kilobyte", "picture: a PNG header of 100,000 x 100,000"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -37,9 +38,7 @@ def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
     """All arrays have the same values; the new store names its base, and a second run finds it complete."""
     base_path, again_path = request.getfixturevalue(f"{family}_store"), tmp_path / "again.zarr"
     assert main(["rerun", str(base_path), "--output", str(again_path)]) == 0
-    assert (
-        "made again without any change: bit-equal, actions and rows (stored with 10 bits)." in capsys.readouterr().out
-    )
+    assert re.search("bit-equal, .*10 bits", capsys.readouterr().out)
     base, again = open_store(base_path), open_store(again_path)
     assert verify_store(again) == []
     assert again.attributes.rerun_of.run == base.run
@@ -57,7 +56,7 @@ def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
         np.testing.assert_array_equal(new.read("steps/actions")[:4], old.read("actions")[0, :4].astype(np.float32))
     assert [episode.attributes.task_family for episode in again.episodes] == 2 * ["lift A"] + 2 * ["stack A on B"]
     assert main(["rerun", str(base_path), "--output", str(again_path), "--resume", "--check", "0"]) == 0
-    assert "4 of 4 episodes are complete already; 0 to run." in capsys.readouterr().out
+    assert re.search("4 of 4 .* 0 to run", capsys.readouterr().out)
 
 
 def test_more_of_the_same_calls_can_be_recorded(pi_store, tmp_path):
@@ -90,7 +89,7 @@ def test_another_result_is_measured_and_the_machines_are_compared(pi_store):
     assert result.actions == pytest.approx(0.5)
     assert result.actions_relative == pytest.approx(0.5 / calls.actions[..., 1].std())
     assert result.rows == 0
-    assert "NOT bit-equal. Actions differ by at most 0.5 of the environment's units" in result.describe()
+    assert re.search(r"NOT bit-equal.* 0\.5 ", result.describe())
 
 
 def test_another_state_than_the_prompts_is_an_error(pi_store):
@@ -98,17 +97,15 @@ def test_another_state_than_the_prompts_is_an_error(pi_store):
     base = open_store(pi_store)
     calls = read_calls(base.episodes[0])
     moved = replace(calls, state=calls.state + 0.5)
-    with pytest.raises(InputsDiffer, match=r"Replan 0 of task000_episode000 gets the prompt 'Task: lift the red cube"):
+    with pytest.raises(InputsDiffer, match=r"Replan 0 of task000_episode000 .*'Task: lift the red cube"):
         check_fidelity(Caller(dummy_policy(), base.attributes.recording), base.attributes.recording, moved, 1, {})
 
 
-def test_wrong_stores_and_settings_are_one_sentence(pi_store, tmp_path, capsys):
-    assert "There is no store at" in refused(
-        capsys, "rerun", tmp_path / "nothing.zarr", "--checkpoint", "untrained-tiny"
-    )
-    assert "into the store itself" in refused(capsys, "rerun", pi_store, "--output", pi_store, "--overwrite")
-    assert "no episode of task 7; it has tasks 0, 1" in refused(capsys, "rerun", pi_store, "--task-id", "7")
-    assert "its weights have the digest" in refused(capsys, "rerun", pi_store, "--checkpoint", "untrained")
+def test_wrong_stores_and_settings_are_named_in_one_line(pi_store, tmp_path, capsys):
+    assert "nothing.zarr" in refused(capsys, "rerun", tmp_path / "nothing.zarr", "--checkpoint", "untrained-tiny")
+    assert "itself" in refused(capsys, "rerun", pi_store, "--output", pi_store, "--overwrite")
+    assert re.search("task 7; .* 0, 1", refused(capsys, "rerun", pi_store, "--task-id", "7"))
+    assert "digest" in refused(capsys, "rerun", pi_store, "--checkpoint", "untrained")
 
 
 def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
@@ -116,7 +113,6 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     shutil.copytree(pi_store, damaged)
     (damaged / "episodes/task001_episode000/state/zarr.json").unlink()
     said = refused(capsys, "rerun", damaged)
-    assert "Cannot rerun" in said
     assert "task001_episode000" in said
     assert "vla-attention capture verify --repair" in said
     # Bytes that were changed are found when they are read.
@@ -138,12 +134,10 @@ def test_a_call_that_turns_nan_costs_its_episode(pi_store, tmp_path, capsys, mon
     assert main(words) == (2 if missing else 0)
     assert left[0] < times
     said = capsys.readouterr()
-    assert ("task000_episode001: The policy's numbers turned NaN or infinite at replan 1" in said.out) is True
-    assert ("The episode begins again." in said.out) is (times == 1)
+    assert re.search("task000_episode001: .* replan 1", said.out)
+    assert ("begins again" in said.out) is (times == 1)
     if missing:
-        assert said.err.startswith(
-            f"vla-capture: 1 of the episodes asked for is missing: task000_episode001 of {target}. "
-        )
+        assert re.search(rf"\b1 of .*: task000_episode001 of {target}\. ", said.err)
         assert said.err.count("\n") == 1
     assert len(open_store(target).episodes) == 4 - len(missing)
     monkeypatch.undo()
@@ -156,7 +150,7 @@ def test_an_existing_store_is_not_overwritten_by_chance(pi_store, tmp_path, caps
     target = tmp_path / "again.zarr"
     arguments = ("rerun", pi_store, "--output", target, "--check", "0", "--num-episodes", "1")
     assert main([str(word) for word in arguments]) == 0
-    assert "add --resume to continue it" in refused(capsys, *arguments)
+    assert "--resume" in refused(capsys, *arguments)
     assert "recording.layers" in refused(capsys, *arguments, "--resume", "--layers", "1")
     assert main([str(word) for word in (*arguments, "--overwrite", "--layers", "1")]) == 0
     assert json.loads((target / "zarr.json").read_text())["attributes"]["recording"]["layers"] == [1]

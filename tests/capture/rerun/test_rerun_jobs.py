@@ -35,11 +35,11 @@ def test_sigterm_drops_the_episode_in_progress(pi_store, tmp_path, monkeypatch, 
     monkeypatch.setattr(Termination, "check", check)
     assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0"]) == EXIT_TERMINATED
     said = capsys.readouterr().out
-    assert "Stopped by SIGTERM: " in said
+    assert "SIGTERM" in said
     # Calls of the next episodes are made while the first one is written, and one that is being committed is whole.
     committed = names(store)
     assert committed == EPISODES[: len(committed)] != []
-    assert f"; {4 - len(committed)} of this process's 4 are missing." in said
+    assert f"; {4 - len(committed)} of this process's 4" in said
     assert read_logs(store)[-1].event == "stopped"
     monkeypatch.undo()
     assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0", "--resume"]) == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -47,7 +49,7 @@ def test_a_checkpoint_is_found_again_and_its_calls_are_bit_equal(checkpoint, tok
     capsys.readouterr()
     again = tmp_path / "again.zarr"
     assert main(["rerun", str(base), "--tokenizer", tokenizer, "--output", str(again)]) == 0
-    assert "Check: 2 policy calls of task000_episode000, made again without any change: bit-eq" in said(capsys)
+    assert re.search(r"\b2 .*task000_episode000.*\bbit-equal", said(capsys))
     old, new = (open_store(path).episodes[0].attributes.arrays for path in (base, again))
     assert old == new
     finer = "lerobot" in checkpoint
@@ -68,4 +70,4 @@ def test_a_changed_picture_of_lerobot_is_of_whole_grey_levels_and_made_again(tok
     np.testing.assert_array_equal(new.read("camera_frames/image2"), old.read("camera_frames/image2"))
     capsys.readouterr()
     assert main(["rerun", str(target), "--tokenizer", tokenizer]) == 0
-    assert "bit-equal, actions and rows" in said(capsys)
+    assert ": bit-equal" in said(capsys)

@@ -57,5 +57,5 @@ def test_several_tasks_are_run_once_each_in_order() -> None:
     assert settings_of("pi").task_ids is None
     assert settings_of("pi", "--task-id", "4").task_ids == (4,)
     assert settings_of("pi", "--task-id", "5", "0", "3", "5").task_ids == (0, 3, 5)
-    with pytest.raises(BadArgument, match="Task 17 does not exist in cubes; its tasks are 0 to 16"):
+    with pytest.raises(BadArgument, match=r"Task 17 .*cubes; .* 0 to 16"):
         settings_of("pi", "--task-id", "0", "17")

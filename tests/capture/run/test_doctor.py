@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +30,7 @@ def test_a_jax_checkpoint_without_its_arrays_is_missing(tmp_path: Path, monkeypa
     monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
     address = "gs://openpi-assets/checkpoints/mine"
     folder = tmp_path / address.removeprefix("gs://")
-    with pytest.raises(UserError, match="is not in openpi's cache"):
+    with pytest.raises(UserError, match=address):
         checkpoint_of("pi", "--checkpoint", address)
     shutil.copytree(GOLDEN / "pi0_batch2" / "checkpoint", folder)
     words = ["--model-config", str(GOLDEN / "pi0_batch2" / "case.json")]
@@ -39,26 +40,26 @@ def test_a_jax_checkpoint_without_its_arrays_is_missing(tmp_path: Path, monkeypa
         if part.name != "_METADATA":
             shutil.rmtree(part) if part.is_dir() else part.unlink()
     for name in (str(folder), address):
-        with pytest.raises(UserError, match="files are missing"):
+        with pytest.raises(UserError, match="params"):
             checkpoint_of("pi", "--checkpoint", name, *words)
 
 
 @pytest.mark.parametrize(
-    ("absent", "said"),
+    ("absent", "named"),
     [
-        (WEIGHTS_NAME, "has no .pt file"),
-        (EMBEDDINGS_NAME, "no text embeddings"),
+        (WEIGHTS_NAME, r"\.pt"),
+        (EMBEDDINGS_NAME, "embeddings"),
         (VAE_NAME, f"hf download {VAE_REPOSITORY}"),
     ],
 )
-def test_every_part_of_a_cosmos_checkpoint_is_looked_for(tmp_path: Path, monkeypatch, absent: str, said: str):
+def test_every_part_of_a_cosmos_checkpoint_is_looked_for(tmp_path: Path, monkeypatch, absent: str, named: str):
     pytest.importorskip("diffusers")
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     folder = write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, ["lift the cube"])
     status, text = checkpoint_of("cosmos", "--ckpt-path", str(folder))
-    assert (status, "of files" in text) == ("ok", True), text
+    assert status == "ok", text
     (folder / absent).unlink()
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=named):
         checkpoint_of("cosmos", "--ckpt-path", str(folder))
 
 
@@ -85,7 +86,6 @@ def test_drawing(renderer: str, status: str):
 def test_a_picture_is_really_drawn():
     status, text = find_drawing(find_suite("cubes"), None)
     assert status in ("ok", "note"), text
-    assert "draws with" in text
 
 
 class NoCuda:
@@ -118,4 +118,4 @@ def test_a_gpu_is_named_with_its_memory():
     version = SimpleNamespace(cuda="12.8")
     status, text = find_gpu("cuda:1", SimpleNamespace(cuda=cuda, version=version, __version__="2.9"))
     assert status == "ok"
-    assert "H100, 6 GB of 80 GB" in text
+    assert re.search("H100.* 6 GB .*80 GB", text)

@@ -32,8 +32,8 @@ from vla_attention.schemas.stores.store_format import (
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"seed": 1}, "protocol.seed is 0"),
-        ({"mantissa_bits": 7}, "recording.mantissa_bits is 10, this run's is 7"),
+        ({"seed": 1}, "protocol.seed .*0,.* 1"),
+        ({"mantissa_bits": 7}, "recording.mantissa_bits .*10,.* 7"),
         ({"policy": "other"}, "policy.name"),
     ],
 )
@@ -53,7 +53,7 @@ def test_a_different_layout_names_the_span(tmp_path):
     other = structs.replace(
         site, spans=(*site.spans[:-1], structs.replace(site.spans[-1], stop=site.spans[-1].stop + 1))
     )
-    with pytest.raises(RunMismatch, match=r"sites\[0\]\.spans\[4\]\.stop is 39, this run's is 40"):
+    with pytest.raises(RunMismatch, match=r"sites\[0\]\.spans\[4\]\.stop .*39,.* 40"):
         open_run(path, structs.replace(attributes, sites=(other,)), "resume")
 
 
@@ -71,7 +71,7 @@ def test_other_provenance_and_another_checkpoint_path_may_resume(tmp_path, unint
 
 def test_an_existing_store_is_refused_resumed_or_overwritten(tmp_path, uninterrupted):
     path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
-    with pytest.raises(StoreExists, match=r"holds 2 episodes.*--resume.*--overwrite"):
+    with pytest.raises(StoreExists, match=r"2 episodes.*--resume.*--overwrite"):
         write_store(path, spec=SPEC)
     write_store(path, mode="overwrite", spec=SPEC)
     assert store_bytes(path) == uninterrupted
@@ -97,12 +97,12 @@ def test_a_store_whose_first_episode_is_being_recorded_is_not_taken(tmp_path, un
     start, _ = episode_records(SPEC, 0, 0)
     with (
         store.episode(start, denoise_times(SPEC)),
-        pytest.raises(StoreExists, match=r"no episode yet, and another run is recording its first one.*--overwrite"),
+        pytest.raises(StoreExists, match="--overwrite"),
     ):
         open_run(path, other, "new")
     with episode_locks(path) as locks:
         locks.acquire("task005_episode000")
-        with pytest.raises(StoreExists, match="another run is recording"):
+        with pytest.raises(StoreExists, match="--overwrite"):
             open_run(path, other, "new")
         write_store(path, spec=SPEC)  # another process of the same run
     assert store_bytes(path) == uninterrupted
@@ -118,7 +118,7 @@ def test_an_episode_is_not_added_to_another_run_that_took_the_place(tmp_path):
         with pytest.raises(RunMismatch, match=r"protocol\.seed"):
             writer.commit(False, 5)
         shutil.rmtree(path)
-    with pytest.raises(StoreError, match="has been removed"), store.episode(start, denoise_times(SPEC)):
+    with pytest.raises(StoreError, match=r"a\.zarr"), store.episode(start, denoise_times(SPEC)):
         pass
 
 
@@ -162,7 +162,7 @@ def test_a_store_of_a_later_format_is_never_touched(tmp_path, mode):
 
 @pytest.mark.parametrize("name", ["a", "a.zarr.zip"])
 def test_a_path_without_the_suffix_is_refused(tmp_path, name):
-    with pytest.raises(BadArgument, match=r"ends with '\.zarr'"):
+    with pytest.raises(BadArgument, match=r"'\.zarr'"):
         write_store(tmp_path / name, spec=SPEC)
     assert list(tmp_path.iterdir()) == []
 
@@ -170,7 +170,7 @@ def test_a_path_without_the_suffix_is_refused(tmp_path, name):
 @pytest.mark.parametrize("parent", ["file/a.zarr"])
 def test_a_parent_that_is_a_file(tmp_path, parent):
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(BadArgument, match="Cannot write a store"):
+    with pytest.raises(BadArgument, match=parent):
         write_store(tmp_path / parent, spec=SPEC)
 
 
@@ -179,7 +179,7 @@ def test_permission_denied_is_one_sentence(tmp_path, monkeypatch):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(BadArgument, match="Permission denied; give another --output"):
+    with pytest.raises(BadArgument, match="--output"):
         open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
 
 

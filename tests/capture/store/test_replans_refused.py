@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -90,44 +91,40 @@ def instruction_beyond_the_text(record: ReplanRecord) -> ReplanRecord:
     return replace(record, prompt=structs.replace(record.prompt, instruction=(0, 999)))
 
 
-#: Name, change, what the writer says. They can be stored: `verify` must find them, too.
+#: Name, change, what the error names (a regular expression). They can be stored: `verify` must find them, too.
 STORABLE: dict[str, tuple[Change, str]] = {
     "infinite row": (
         rows_with(rows=put((1, 0, 1, 0, 7), np.inf)),
-        "joint/rows holds numbers that are NaN or infinite at replan 1, denoise step 3, layer 7, head 5",
+        "joint/rows .*infinite.* replan 1, denoise step 3, layer 7, head 5",
     ),
     "wrong row sum": (
         rows_with(row_sum=put((1, 1, 1, 0), 1.0008)),
-        "joint/rows does not add up to the row sums: they differ by up to 0.0008 of them, allowed is 1e-05, at "
-        "replan 1, denoise step 9, layer 7, head 5",
+        r"joint/rows .*sums.* 0\.0008 .*1e-05, at replan 1, denoise step 9, layer 7, head 5",
     ),
     "rows that sum to 2": (
         doubled,
-        "joint/row_sum is 2 instead of 1 (allowed is a difference of 0.001) at replan 1, denoise step 9, layer 4, "
-        "head 5",
+        r"joint/row_sum is 2 .*1 .*0\.001\) at replan 1, denoise step 9, layer 4, head 5",
     ),
     "mass for padding": (
         rows_with(rows=mass_to_padding),
-        "joint/rows gives mass to a key that no query sees, as joint/uniform says, at replan 1, denoise step 3, layer "
-        "7, head 5",
+        "joint/rows .*joint/uniform.* replan 1, denoise step 3, layer 7, head 5",
     ),
     "asymmetric contributions": (
         rows_with(contribution=put((1, 0, 0, 1), 1e6)),
-        "joint/contribution is not symmetric at replan 1, denoise step 3, layer 7",
+        "joint/contribution .*symmetric.* replan 1, denoise step 3, layer 7",
     ),
     "no inner products": (
         rows_with(contribution=lambda gram: gram[0, 1].fill(0) or put((0, 1, [0, 1], [1, 0]), 1.0)(gram)),
-        "joint/contribution holds no inner products of vectors (it has negative eigenvalues) at replan 1, denoise step "
-        "9, layer 4",
+        "joint/contribution .*eigenvalues.* replan 1, denoise step 9, layer 4",
     ),
-    "a word that is padding": (roles_with(21, Role.PADDING), "but it holds the prompt's piece 'put'"),
+    "a word that is padding": (roles_with(21, Role.PADDING), "'put'"),
     "coverage of another camera": (
         coverage_with(lambda shares: shares[:4]),
-        "12, 5): the camera's 3 x 4 patches, and the scene's objects",
+        r"12, 5\): .*3 x 4 patches",
     ),
     "more than a patch": (
         coverage_with(put((5, 2), 1.5)),
-        "objects/base_0_rgb has the share 1.5; expected 0 to 1, at replan 1, patch 5, object 2",
+        r"objects/base_0_rgb .*1\.5; .*0 to 1, at replan 1, patch 5, object 2",
     ),
     "an unknown camera": (
         lambda record: replace(
@@ -135,35 +132,34 @@ STORABLE: dict[str, tuple[Change, str]] = {
             frames={**record.frames, "left": record.frames["base_0_rgb"]},
             coverage={**record.coverage, "left": record.coverage["base_0_rgb"]},
         ),
-        "frames/left is of a camera that no site has; existing: base_0_rgb, left_wrist_0_rgb, right_wrist_0_rgb",
+        "frames/left .*base_0_rgb, left_wrist_0_rgb, right_wrist_0_rgb",
     ),
-    "an instruction beyond the text": (instruction_beyond_the_text, "stands at characters 0 to 999 of a prompt with"),
+    "an instruction beyond the text": (instruction_beyond_the_text, "0 to 999"),
 }
 
 #: What the store has no place for, or reads as a lost chunk.
 UNSTORABLE: dict[str, tuple[Change, str]] = {
     "NaN in two rows": (
         rows_with(rows=put((slice(None), 1, 1, 0, 7), np.nan)),
-        "joint/rows holds numbers that are NaN or infinite at replan 1, denoise step 9, layer 4, head 5, and at 2 of 8 "
-        "places in all",
+        "joint/rows .*NaN.* replan 1, denoise step 9, layer 4, head 5, .* 2 of 8 ",
     ),
     "NaN row sum": (
         rows_with(row_sum=put((1, 0, 0, 0), np.nan)),
-        "joint/row_sum is nan instead of 1 (allowed is a difference of 0.001) at replan 1, denoise step 3, layer 7",
+        r"joint/row_sum is nan .*1 .*0\.001\) at replan 1, denoise step 3, layer 7",
     ),
     "rows of too few heads": (
         rows_with(rows=lambda rows: rows[:, :, :1]),
-        "joint/rows has the shape (1, 2, 2, 1, 1, 39); expected (1, 2, 2, 2, 1, 39)",
+        r"joint/rows .*\(1, 2, 2, 1, 1, 39\); .*\(1, 2, 2, 2, 1, 39\)",
     ),
-    "no contributions": (without_contribution, "it has no joint/contribution"),
+    "no contributions": (without_contribution, "joint/contribution"),
     "no role": (
         roles_with(3, 99),
-        "joint/key_role gives a key of span 'base_0_rgb' the code 99, which is no role; expected image, ",
+        "joint/key_role .*'base_0_rgb' .*99.* image",
     ),
-    "no site": (with_(rows={}), "it has rows of the sites none; expected joint"),
-    "NaN state": (with_(state=np.array([np.nan] * 8)), "state holds numbers that are NaN or infinite"),
-    "no pictures": (with_(frames={}), "frames/base_0_rgb is not given, at the first replan of the shape ("),
-    "negative seed": (with_(noise_seed=-1), "noise_seed is -1; expected 0 or more"),
+    "no site": (with_(rows={}), "none.* joint"),
+    "NaN state": (with_(state=np.array([np.nan] * 8)), "state .*NaN"),
+    "no pictures": (with_(frames={}), "frames/base_0_rgb"),
+    "negative seed": (with_(noise_seed=-1), "noise_seed is -1"),
 }
 
 
@@ -173,13 +169,12 @@ def test_replans_that_cannot_be_right_are_refused_and_leave_nothing(tmp_path):
     start, records = episode_records(SPEC, 0, 0)
     with store.episode(start, denoise_times(SPEC)) as writer:
         writer.append(records[0])
-        for name, (change, message) in (STORABLE | UNSTORABLE).items():
+        for name, (change, named) in (STORABLE | UNSTORABLE).items():
             with pytest.raises(ReplanRefused) as caught:
                 writer.append(change(records[1]))
             text = str(caught.value)
-            assert text.startswith("Cannot store replan 1 (environment step 1"), name
-            assert f"of episode task000_episode000 of {store.path}: " in text, name
-            assert message in text, (name, text)
+            assert re.search(rf"replan 1 \(environment step 1.*task000_episode000 of {store.path}: ", text), name
+            assert re.search(named, text), (name, text)
             assert isinstance(caught.value, UserError)
         for record in records[1:]:
             writer.append(record)
@@ -196,7 +191,7 @@ def test_verify_reports_what_the_writer_refuses(tmp_path, monkeypatch, name):
     """Written by a writer without rules: checksums, digests and seal are in order."""
     monkeypatch.setattr(EpisodeWriter, "_problems", lambda writer, record: iter(()))
     monkeypatch.setattr(EpisodeWriter, "_read_back", lambda writer, run: None)
-    change, message = STORABLE[name]
+    change, named = STORABLE[name]
     # A changed role makes another number of parts, which the contributions would contradict, too.
     spec = replace(SPEC, mantissa_bits=23, contributions=" role" not in name)
     store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new", durable=False)
@@ -208,7 +203,7 @@ def test_verify_reports_what_the_writer_refuses(tmp_path, monkeypatch, name):
             writer.append(record)
         commit(writer, spec, 0, 0)
     problems = [fault.problem for fault in verify_store(open_store(store.path))]
-    assert any(message in problem for problem in problems), problems
+    assert any(re.search(named, problem) for problem in problems), problems
 
 
 def test_an_object_out_of_view_and_rounded_rows_are_no_fault(tmp_path):

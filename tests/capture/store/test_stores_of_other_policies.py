@@ -44,58 +44,58 @@ def append(path: Path, spec: SiteStoreSpec, changes: dict[int, Change]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spec", "changes", "says"),
+    ("spec", "changes", "named"),
     [
         (
             SiteStoreSpec(kind="growing", contributions=False),
             {1: move_mass("joint", 33)},
-            "joint/rows gives mass to a key with the role 'absent' at replan 1",
+            "joint/rows .*'absent' at replan 1",
         ),
         (
             SiteStoreSpec(kind="growing", queries="all", replans=1, contributions=False),
             {0: move_mass("joint", 30, query=2)},
-            "a key of the growing span 'generated' that .* at replan 0, denoise step 0, layer 0, head 0, query 2",
+            "'generated' .* at replan 0, denoise step 0, layer 0, head 0, query 2",
         ),
         (
             SiteStoreSpec(),
             {1: lambda record: replace(record, state=None)},
-            "state is not given, at the first replan of the shape",
+            "state",
         ),
         (
             SiteStoreSpec(dataset_actions=0.5),
             {1: lambda record: replace(record, dataset_actions=np.zeros((3, 4)))},
-            r"dataset_actions is of the shape \(4,\), at the first replan of the shape \(3,\)",
+            r"dataset_actions .*\(4,\),.*\(3,\)",
         ),
     ],
 )
-def test_replans_that_are_refused(tmp_path, spec, changes, says):
-    with pytest.raises(ReplanRefused, match=says):
+def test_replans_that_are_refused(tmp_path, spec, changes, named):
+    with pytest.raises(ReplanRefused, match=named):
         append(tmp_path / "a.zarr", spec, changes)
     assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
 
 
 @pytest.mark.parametrize(
-    ("spec", "changes", "says"),
+    ("spec", "changes", "named"),
     [
         (
             SiteStoreSpec(kind="growing", contributions=False),
             {1: move_mass("joint", 33)},
-            "the role 'absent' at replan 1",
+            "'absent' at replan 1",
         ),
         (
             SiteStoreSpec(kind="growing", queries="all", replans=1, contributions=False),
             {0: move_mass("joint", 30, query=2)},
-            "growing span 'generated'",
+            "'generated'",
         ),
     ],
 )
-def test_verify_reports_what_the_writer_let_through(tmp_path, monkeypatch, spec, changes, says):
+def test_verify_reports_what_the_writer_let_through(tmp_path, monkeypatch, spec, changes, named):
     with monkeypatch.context() as patch:
         patch.setattr(EpisodeWriter, "_problems", lambda writer, record: iter(()))
         patch.setattr(EpisodeWriter, "_read_back", lambda writer, run: None)
         append(tmp_path / "a.zarr", spec, changes)
     (fault,) = verify_store(open_store(tmp_path / "a.zarr"))
-    assert says in fault.problem
+    assert named in fault.problem
 
 
 def test_arrays_that_nobody_knows_are_missing_and_no_fault(tmp_path):

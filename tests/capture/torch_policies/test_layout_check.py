@@ -86,19 +86,19 @@ STATE_LAST = with_spans(
 
 
 @pytest.mark.parametrize(
-    ("layout", "selector", "verdict"),
+    ("layout", "selector", "still", "moved"),
     [
-        (IMAGE_LAST, "camera:front", "no: image_front did not move; prompt (keys 0..3) moved"),
-        (IMAGE_LAST, "word:bowl", "no: prompt (key 3) did not move; image_front (key 7) moved"),
-        (STATE_LAST, "span:state", "no: state did not move; actions (key 10) moved"),
+        (IMAGE_LAST, "camera:front", "image_front", "prompt (keys 0..3)"),
+        (IMAGE_LAST, "word:bowl", "prompt (key 3)", "image_front (key 7)"),
+        (STATE_LAST, "span:state", "state", "actions (key 10)"),
     ],
 )
-def test_a_wrong_layout_does_not(policy, layout, selector, verdict):
+def test_a_wrong_layout_does_not(policy, layout, selector, still, moved):
     found = check(policy, layout, {selector: changes(policy)[selector]})
-    assert found.fits == (verdict == "yes")
-    assert str(found).splitlines()[-1].endswith(verdict)
-    if not found.fits:
-        assert "1 of 1 do not fit" in str(found)
+    assert not found.fits
+    verdict = str(found).splitlines()[-1]
+    assert -1 < verdict.find(f" {still} ") < verdict.find(f" {moved} ")
+    assert "1 of 1" in str(found)
 
 
 def test_a_prompt_of_changing_length_and_generated_tokens():
@@ -112,8 +112,8 @@ def test_a_prompt_of_changing_length_and_generated_tokens():
     settings = {"tokenizer": policy.tokenizer, "instruction": TEXT}
     found = va.check_layout(policy, lambda: policy.act(picture, TEXT), token_layout(), perturb, **settings)
     assert [change.fits for change in found.changes] == [True, True, False]
-    assert found.changes[2].verdict == f"no: prompt (key {PATCHES + 5}) moved"
-    with pytest.raises(BadArgument, match="'span:generated' takes no key that the policy call has"):
+    assert f" prompt (key {PATCHES + 5}) " in found.changes[2].verdict
+    with pytest.raises(BadArgument, match="'span:generated'"):
         va.check_layout(
             policy, lambda: policy.act(picture, TEXT), token_layout(), {"span:generated": perturb["word:the"]}
         )
@@ -125,7 +125,7 @@ def test_sites_of_the_first_block_and_a_chosen_one():
     perturb = {"span:prefix": lambda: policy.act(1 + prefix, noise)}
     found = va.check_layout(policy, lambda: policy.act(prefix, noise), one_module_layout(), perturb)
     assert [(change.site, change.block, change.fits) for change in found.changes] == [("self", 0, True)]
-    assert str(found).splitlines()[-1].startswith("Not looked at: cross, whose first block comes after others")
+    assert "cross" in str(found).splitlines()[-1]
     found = va.check_layout(policy, lambda: policy.act(prefix, noise), one_module_layout(), perturb, site="cross")
     assert [(change.site, change.block, change.fits) for change in found.changes] == [("cross", 1, True)]
 
@@ -142,23 +142,21 @@ def test_the_same_random_numbers_and_others(policy):
     assert found.fits
     assert torch.equal(torch.random.get_rng_state(), before)
     numbers = iter(range(9))
-    with pytest.raises(NotRepeatable, match="spans actions at site 'joint' are others when the unchanged call is made"):
+    with pytest.raises(NotRepeatable, match="actions at site 'joint'"):
         va.check_layout(policy, lambda: act(numbers), small_layout(), {"span:state": act})
 
 
-def test_mistakes_are_sentences(policy):
+def test_mistakes_name_what_was_given(policy):
     own, layout = call(policy), small_layout()
-    with pytest.raises(BadArgument, match="got no changes; expected a dictionary"):
+    with pytest.raises(BadArgument, match="changes"):
         va.check_layout(policy, own, layout, {})
-    with pytest.raises(BadArgument, match="'word:bowl' needs tokenizer= and instruction="):
+    with pytest.raises(BadArgument, match=r"'word:bowl'.*tokenizer=.*instruction="):
         va.check_layout(policy, own, layout, {"word:bowl": own})
-    with pytest.raises(SelectorError, match=r"there is no camera 'frond'\. Did you mean 'front'"):
+    with pytest.raises(SelectorError, match=r"'frond'.*'front'"):
         va.check_layout(policy, own, layout, {"camera:frond": own})
-    with pytest.raises(
-        CallsDoNotFit, match=r"calls at the unchanged call do not fit .* has 2 heads|must compute 3 times"
-    ):
+    with pytest.raises(CallsDoNotFit, match=r"has 2 heads|3 times"):
         va.check_layout(policy, own, small_layout(num_denoise_steps=3, denoise_times=()), {"span:state": own})
-    with pytest.raises(NoAttention, match="In the call for 'span:state': The policy"):
+    with pytest.raises(NoAttention, match="'span:state'"):
         va.check_layout(policy, own, layout, {"span:state": lambda: None})
-    with pytest.raises(BadArgument, match=r"has a batch of 2; give va\.check_layout policy calls for one environment"):
+    with pytest.raises(BadArgument, match="batch of 2"):
         va.check_layout(policy, lambda: policy.act(**given(batch=2)), layout, {"span:state": own})

@@ -57,7 +57,7 @@ def test_action_queries_count_from_either_end(given, count, expected):
 
 @pytest.mark.parametrize("given", [(-4, None), (0, 5), (3, None)])
 def test_a_call_with_fewer_queries_is_refused(given):
-    with pytest.raises(BadArgument, match="the call has 3 queries"):
+    with pytest.raises(BadArgument, match="3 queries"):
         replace(SITE, action_queries=given).queries(3)
 
 
@@ -76,48 +76,45 @@ def test_roles_of_masked_keys_follow_the_spans():
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"rules": (CallRule("vision.*", None),)}, "no rule gives calls to the site 'joint'"),
-        ({"denoise_times": (1.0,)}, "1 denoise times for 4 denoise steps"),
-    ],
+    ("changes", "named"),
+    [({"rules": (CallRule("vision.*", None),)}, "'joint'"), ({"denoise_times": (1.0,)}, " 1 .* 4 ")],
 )
-def test_what_does_not_fit_is_said(changes, sentence):
-    with pytest.raises(BadArgument, match=re.escape(sentence)):
+def test_what_does_not_fit_is_said(changes, named):
+    with pytest.raises(BadArgument, match=named):
         replace(LAYOUT, **changes)
 
 
 def test_rules_and_sites_check_themselves():
-    with pytest.raises(BadArgument, match="no regular expression"):
+    with pytest.raises(BadArgument, match=r"'\('"):
         CallRule("(", None)
-    with pytest.raises(BadArgument, match="does not say which block"):
+    with pytest.raises(BadArgument, match=r"'blocks' .*'joint'"):
         CallRule("blocks", "joint")
     for call in (None, (None, 0), ("joint", None), ("joint",)):
-        with pytest.raises(BadArgument, match="in its sequence; expected site and block of each call"):
+        with pytest.raises(BadArgument, match="sequence"):
             CallRule("blocks", None, sequence=(("joint", 0), call))
-    with pytest.raises(BadArgument, match="no role for the spans actions"):
+    with pytest.raises(BadArgument, match="actions"):
         RecordedSite(KEYS, (0, 1), {"image_front": "image", "prompt": "text"})
 
 
 @pytest.mark.parametrize(
-    ("kind", "role", "wrong"),
+    ("kind", "role"),
     [
-        ("time", "learned", "there is no kind 'time'"),
-        ("learned", "learned", "there is no kind 'learned'"),
-        ("states", "state", "there is no kind 'states'"),
-        ("state", "time", "there is no role 'time'"),
-        ("state", "learnt", "there is no role 'learnt'"),
-        ("latent", "learned", "they do not fit together"),
-        ("image", "instruction", "they do not fit together"),
-        (None, None, "there is no kind 'None'"),
+        ("time", "learned"),
+        ("learned", "learned"),
+        ("states", "state"),
+        ("state", "time"),
+        ("state", "learnt"),
+        ("latent", "learned"),
+        ("image", "instruction"),
+        (None, None),
     ],
 )
-def test_a_wrong_kind_or_role_shows_all_that_there_are_and_which_fit_together(kind, role, wrong):
+def test_a_wrong_kind_or_role_shows_all_that_there_are_and_which_fit_together(kind, role):
     keys = SiteLayout("joint", (Span("clock", kind, 0, 1),))
     with pytest.raises(BadArgument) as caught:
         RecordedSite(keys, (0, 1), {"clock": role})
     said = str(caught.value)
-    assert f"gives the span 'clock' the kind '{kind}' and the role '{role}': {wrong}" in said
+    assert all(named in said for named in ("'clock'", f"'{kind}'", f"'{role}'"))
     with pytest.raises(BadArgument) as missing:
         RecordedSite(keys, (0, 1), {})
     for one, roles in ROLES_OF_KIND.items():

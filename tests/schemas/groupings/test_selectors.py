@@ -30,7 +30,7 @@ def test_a_new_kind_is_one_entry_of_the_table(monkeypatch):
     weights = resolve(grouping, tokens).weights
     assert np.flatnonzero(weights[0, :, 0]).tolist() == [12, 15, 18, 21, 24, 27, 30, 33, 36]
     assert (weights.sum(axis=2) == 1).all()
-    with pytest.raises(SelectorError, match="Group 'some', selector 'every:99': '99' is no step"):
+    with pytest.raises(SelectorError, match=r"'some'.*'every:99'"):
         check_names(Grouping("g", {"some": ("every:99",)}), vocabulary)
-    with pytest.raises(SelectorError, match="did you mean 'every'"):
+    with pytest.raises(SelectorError, match="'every'"):
         Grouping("g", {"some": ("evry:3",)})

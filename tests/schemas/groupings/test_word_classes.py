@@ -58,24 +58,24 @@ def test_shared_keys_are_the_sums_of_what_both_groups_take(data):
 
 
 @pytest.mark.parametrize(
-    ("selector", "said"),
+    ("selector", "named"),
     [
-        ("words:nouns", "no word class 'nouns'. Existing: content, stop, all"),
-        ("words:contents", "Did you mean 'content'?"),
-        ('word:"bowl black"', "no instruction has the words 'bowl black' one after the other. Nearest: 'put the black"),
-        ('word:"!?"', "is no word"),
+        ("words:nouns", ["'nouns'", "content, stop, all"]),
+        ("words:contents", ["'contents'", "'content'"]),
+        ('word:"bowl black"', ["'bowl black'", "'put the black"]),
+        ('word:"!?"', ["'!?'"]),
     ],
 )
-def test_what_exists_nowhere_is_said(selector, said):
+def test_what_exists_nowhere_is_said(selector, named):
     tokens = bowl_tokens(replans=1)
     with pytest.raises(SelectorError) as caught:
         check_names(Grouping("g", {"g": (selector,)}), collect_vocabulary([tokens]))
-    assert said in str(caught.value)
+    assert [name for name in named if name not in str(caught.value)] == []
 
 
 def test_single_quotes_and_apostrophes():
     assert parse_selector("word:'black bowl'") == Atom("word", "black bowl")
     assert parse_selector("word:o'brien") == Atom("word", "o'brien")
     assert parse_selector("word:\"o'brien's mug\"") == Atom("word", "o'brien's mug")
-    with pytest.raises(SelectorError, match="expected a name after 'word:'"):
+    with pytest.raises(SelectorError, match="'word:'"):
         parse_selector("word:''")

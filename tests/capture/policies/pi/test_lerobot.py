@@ -199,7 +199,7 @@ def test_renamed_cameras_and_empty_cameras_that_only_a_number_states(checkpoint,
         config["empty_cameras"] = 1
 
     edit(checkpoint / "config.json", change)
-    with pytest.raises(BadArgument, match=r"None of the policy's cameras top, wrist.*agentview, .*--camera"):
+    with pytest.raises(BadArgument, match=r"top, wrist.*agentview, .*--camera"):
         load(checkpoint, tokenizer_path)
     names = {"observation.images.image": "observation.images.wrist"}
     step = {"registry_name": "rename_observations_processor", "config": {"rename_map": names}}
@@ -223,21 +223,21 @@ def test_weights_without_prefix_and_without_embed_tokens(checkpoint, tokenizer_p
 
 
 @pytest.mark.parametrize(
-    ("change", "expected"),
+    ("change", "named"),
     [
         ({"use_relative_actions": True}, "use_relative_actions True"),
         ({"rtc_config": {"enabled": True}}, "rtc_config {'enabled': True}"),
-        ({"n_action_steps": 51}, "n_action_steps 51 of a chunk_size"),
-        ({"dtype": "float16"}, "supported are float32 and bfloat16"),
-        ({"output_features": {"action": {"type": "ACTION", "shape": [14]}}}, "actions of 14 numbers.*another robot"),
+        ({"n_action_steps": 51}, "n_action_steps 51.* chunk_size"),
+        ({"dtype": "float16"}, "float32 .*bfloat16"),
+        ({"output_features": {"action": {"type": "ACTION", "shape": [14]}}}, "\\b14 "),
     ],
 )
-def test_unsupported_features_are_refused_by_name(checkpoint, tokenizer_path, change, expected):
+def test_unsupported_features_are_refused_by_name(checkpoint, tokenizer_path, change, named):
     edit(checkpoint / "config.json", lambda content: content.update(change))
-    if expected.startswith("actions of 14"):  # statistics are checked first: leave them out of it
+    if "output_features" in change:  # statistics are checked first: leave them out of it
         for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
             edit(checkpoint / name, lambda c: [s["config"].update(norm_map={"ACTION": "IDENTITY"}) for s in c["steps"]])
-    with pytest.raises((UnsupportedCheckpoint, CheckpointMismatch), match=expected) as caught:
+    with pytest.raises((UnsupportedCheckpoint, CheckpointMismatch), match=named) as caught:
         load(checkpoint, tokenizer_path)
     assert isinstance(caught.value, UserError)
     assert "\n" not in str(caught.value)
@@ -248,21 +248,21 @@ def step_of(content, name):
 
 
 @pytest.mark.parametrize(
-    ("file", "change", "expected"),
+    ("file", "change", "named"),
     [
-        ("pre", lambda c: c["steps"].append({"registry_name": "crop_processor"}), "not supported: 'crop_processor'"),
-        ("pre", lambda c: c["steps"].append(step_of(c, "tokenizer_processor")), "tokenizer_processor twice"),
+        ("pre", lambda c: c["steps"].append({"registry_name": "crop_processor"}), "'crop_processor'"),
+        ("pre", lambda c: c["steps"].append(step_of(c, "tokenizer_processor")), "tokenizer_processor"),
         ("pre", lambda c: step_of(c, "relative_actions_processor")["config"].update(enabled=True), "relative"),
         ("pre", lambda c: step_of(c, "tokenizer_processor")["config"].update(padding_side="left"), "padding_side"),
         ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(STATE="MIN_MAX"), "MIN_MAX"),
         ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(VISUAL="MEAN_STD"), "images"),
     ],
 )  # fmt: skip
-def test_unsupported_pipelines_are_refused_by_name(checkpoint, file, change, expected):
+def test_unsupported_pipelines_are_refused_by_name(checkpoint, file, change, named):
     edit(checkpoint / f"policy_{file}processor.json", change)
     config = read_lerobot_config(checkpoint)
 
-    with pytest.raises(UserError, match=expected):
+    with pytest.raises(UserError, match=named):
         read_lerobot_pipeline(checkpoint, config)
 
 
@@ -272,10 +272,10 @@ def test_missing_damaged_and_misshapen_statistics(checkpoint):
     key = "observation.state.q01" if config.pi05 else "observation.state.mean"
     tensors = load_file(state_file)
     save_file({**tensors, key: tensors[key][:7].clone()}, state_file)
-    with pytest.raises(UnreadableCheckpoint, match=rf"{key}' .* shape \(7,\); 8 numbers are needed"):
+    with pytest.raises(UnreadableCheckpoint, match=rf"{key}' .*\(7,\).* 8 "):
         read_lerobot_pipeline(checkpoint, config)
     state_file.unlink()
-    with pytest.raises(UnreadableCheckpoint, match="not there"):
+    with pytest.raises(UnreadableCheckpoint):
         read_lerobot_pipeline(checkpoint, config)
 
 
@@ -283,13 +283,13 @@ def test_the_type_must_be_that_of_the_tensors(checkpoint, tokenizer_path):
     pi05 = read_lerobot_config(checkpoint).pi05
     other = GOLDEN / ("pi0_batch2" if pi05 else "pi05_batch2") / "checkpoint_lerobot" / "model.safetensors"
     shutil.copy(other, checkpoint / "model.safetensors")
-    with pytest.raises(CheckpointMismatch, match="its tensors are those of pi0"):
+    with pytest.raises(CheckpointMismatch, match=r"pi0\b"):
         load(checkpoint, tokenizer_path)
 
 
 def test_sizes_that_only_a_case_file_states(checkpoint, tokenizer_path, tmp_path):
     (tmp_path / "case.json").rename(tmp_path / "sizes.json")
-    with pytest.raises(CheckpointMismatch, match=r"instead of .*--model-config PATH .*case\.json beside"):
+    with pytest.raises(CheckpointMismatch, match=r"--model-config PATH .*case\.json"):
         load(checkpoint, tokenizer_path)
     assert (
         load(checkpoint, tokenizer_path, model_config=tmp_path / "sizes.json")

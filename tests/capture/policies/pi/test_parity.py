@@ -32,7 +32,7 @@ def test_every_format_of_a_case_passes(name, capsys):
         assert table.max() == result["attention_max"]
 
 
-def test_other_numbers_are_beyond_the_limit(tmp_path, capsys):
+def test_other_numbers_are_beyond_the_limit(tmp_path):
     folder = shutil.copytree(GOLDEN / "pi05_batch2", tmp_path / "case")
     shutil.rmtree(folder / "checkpoint_lerobot")
     with np.load(folder / "expected.npz") as stored:
@@ -40,7 +40,6 @@ def test_other_numbers_are_beyond_the_limit(tmp_path, capsys):
     expected["attn"][0, 0, 0, 0, 0, 0] += 0.01
     np.savez(folder / "expected.npz", **expected)
     assert main([str(folder)]) == 1
-    assert "BEYOND THE LIMIT" in capsys.readouterr().out
 
 
 @pytest.mark.thorough

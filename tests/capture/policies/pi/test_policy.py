@@ -108,7 +108,7 @@ def test_a_changed_picture_and_no_words_reach_the_model(policy, observation):
     assert Role.INSTRUCTION not in changed.key_role["joint"]
     assert np.isfinite(policy.act(changed, 3)).all()
     for empty in ("", "__"):
-        with pytest.raises(BadArgument, match="is empty: a policy needs at least one word"):
+        with pytest.raises(BadArgument, match="empty"):
             policy.prepare(observation, empty)
 
 
@@ -181,7 +181,7 @@ def test_a_tokenizer_of_another_full_size_model_is_refused(dummy):
     for count in (256_000, 257_152):
         check_vocabulary(Pieces(count), 257_152, "pi05")
     for count in (32_000, 300_000):
-        with pytest.raises(BadArgument, match=rf"{count} pieces.*another model's tokenizer"):
+        with pytest.raises(BadArgument, match=rf"{count} pieces"):
             check_vocabulary(Pieces(count), 257_152, "pi05")
 
 
@@ -192,7 +192,7 @@ def test_a_cut_prompt_is_reported_once_and_stays_visible(dummy, observation, cap
         given = policy.prepare(observation, INSTRUCTION)
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "more than the policy's 12 slots; they are cut" in said
+    assert "12 slots" in said
     assert len(given.prompt.pieces) == 11
     assert given.prompt.text.endswith(";\nAction: ")
     assert given.prompt.pieces[-1].stop < len(given.prompt.text)

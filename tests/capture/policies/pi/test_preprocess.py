@@ -118,7 +118,7 @@ def test_wide_and_tall_images_are_padded_centrally():
 
 
 def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
-    with pytest.raises(CheckpointNotFound, match=r"no norm_stats\.json below"):
+    with pytest.raises(CheckpointNotFound, match=r"norm_stats\.json"):
         read_norm_stats(tmp_path)
     target = tmp_path / "assets" / "physical-intelligence" / "libero" / "norm_stats.json"
     target.parent.mkdir(parents=True)
@@ -127,14 +127,14 @@ def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
     second = tmp_path / "assets" / "droid" / "norm_stats.json"
     second.parent.mkdir()
     second.write_text("{}")
-    for wrong, said in (
-        ({}, r"statistics of droid, physical-intelligence/libero; say which with --asset-id NAME"),
-        ({"asset_id": "libero"}, r"Unknown asset id .*Existing: droid, physical-intelligence/libero"),
-        ({"given": tmp_path / "none.json"}, "no file of statistics at"),
-        ({"given": tmp_path / "assets"}, "is a folder; expected a file"),
+    for wrong, named in (
+        ({}, "droid, physical-intelligence/libero.*--asset-id NAME"),
+        ({"asset_id": "libero"}, "libero.*droid, physical-intelligence/libero"),
+        ({"given": tmp_path / "none.json"}, r"none\.json"),
+        ({"given": tmp_path / "assets"}, "folder"),
         ({"asset_id": "droid"}, "norm_stats"),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=named):
             read_norm_stats(tmp_path, **wrong)
     for right in ({"asset_id": "physical-intelligence/libero"}, {"given": FOLDER / "norm_stats.json"}):
         np.testing.assert_array_equal(read_norm_stats(tmp_path, **right).actions.q99, stats.actions.q99)
@@ -147,12 +147,12 @@ def numbers(dim):
 def test_statistics_must_be_those_of_state_and_actions(stats):
     stats.check(8, 7, 32)
     NormStats(numbers(32), numbers(32)).check(8, 7, 32)
-    for state, actions, message in (
-        (7, 7, "'state' have 7 numbers; 8 are needed"),
-        (14, 7, "'state' have 14 numbers; 8 are needed"),
-        (8, 8, r"'actions' have 8 numbers; 7 are needed \(or 32, padded\)"),
+    for state, actions, needed in (
+        (7, 7, "'state' .* 7 .* 8 "),
+        (14, 7, "'state' .* 14 .* 8 "),
+        (8, 8, "'actions' .* 8 .* 7 .* 32"),
     ):
-        with pytest.raises(UnreadableCheckpoint, match=message):
+        with pytest.raises(UnreadableCheckpoint, match=needed):
             NormStats(numbers(state), numbers(actions)).check(8, 7, 32)
-    with pytest.raises(UnreadableCheckpoint, match="no q01 and q99"):
+    with pytest.raises(UnreadableCheckpoint, match="q01 and q99"):
         numbers(8).normaliser("quantile")

@@ -144,5 +144,5 @@ def test_bytes_of_one_character_share_its_range(tokenizer):
 def test_a_prompt_that_does_not_fit_is_refused_not_cut(tokenizer):
     fits = int(tokenizer.tokenize("open the door", max_token_len=48).mask.sum())
     assert tokenizer.tokenize("open the door", max_token_len=fits).mask.all()
-    with pytest.raises(BadArgument, match=rf"'open the door' has {fits} tokens, but the model has room for {fits - 1}"):
+    with pytest.raises(BadArgument, match=rf"'open the door' .* {fits} .* {fits - 1}"):
         tokenizer.tokenize("open the door", max_token_len=fits - 1)

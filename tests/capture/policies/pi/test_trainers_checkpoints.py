@@ -66,14 +66,14 @@ def build(folder: Path, tokenizer: str, **options):
 
 def test_a_step_of_openpi_s_training_is_read_with_its_sizes(tmp_path, tokenizer):
     folder = trained(tmp_path / "run" / "29999")
-    with pytest.raises(UserError, match=r"no config\.json.*--config-name NAME .*pi05_libero.*--model-config FILE"):
+    with pytest.raises(UserError, match=r"config\.json.*--config-name NAME .*pi05_libero.*--model-config FILE"):
         build(folder, tokenizer)
     policy = build(folder, tokenizer, model_config=CASE)
     expected = load_file(folder / "model.safetensors")
     name = "action_in_proj.weight"
     assert torch.equal(policy.model.state_dict()[name], expected[name])
     assert policy.identity().config["model_config"] == str(CASE)
-    with pytest.raises(UserError, match="tensors are not those of the model"):
+    with pytest.raises(UserError, match="tensors"):
         build(folder, tokenizer, config_name="pi05_libero")  # of another size
 
 
@@ -88,17 +88,17 @@ def test_weights_in_several_files_are_those_of_one(tmp_path, tokenizer, of):
     assert build(folder, tokenizer, model_config=CASE).identity().digest == whole
     first = sorted(set(file_of.values()))[0]
     (folder / first).rename(tmp_path / first)
-    with pytest.raises(UserError, match=f"There is no '.*{first}', which the checkpoint needs"):
+    with pytest.raises(UserError, match=first):
         build(folder, tokenizer, model_config=CASE)
     tensors = load_file(tmp_path / first)
     dropped = sorted(tensors)[0]
     del tensors[dropped]
     save_file(tensors, folder / first)
-    with pytest.raises(UserError, match=f"disagree on where {dropped} is"):
+    with pytest.raises(UserError, match=dropped):
         build(folder, tokenizer, model_config=CASE)
     outside = {"weight_map": dict.fromkeys(file_of, "../model.safetensors")}
     (folder / "model.safetensors.index.json").write_text(json.dumps(outside))
-    with pytest.raises(UserError, match="no weight_map from tensors to files beside it"):
+    with pytest.raises(UserError, match="weight_map"):
         build(folder, tokenizer, model_config=CASE)
 
 
@@ -145,24 +145,24 @@ def two_statistics(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "named"),
     [
-        (adapter, r"adapter \(LoRA\) of my/pi05.*merge_and_unload"),
-        (unmerged, r"matrices of an adapter \(LoRA\).*merge_and_unload"),
-        (run_of_openpi, r"holds checkpoints rather than being one; give one of its folders 29999, 20000, 5000\."),
+        (adapter, "my/pi05.*merge_and_unload"),
+        (unmerged, "merge_and_unload"),
+        (run_of_openpi, r"29999, 20000, 5000\."),
         (run_of_lerobot, r"checkpoints/020000/pretrained_model, checkpoints/005000/pretrained_model\."),
-        (without_weights, r"is not a pi checkpoint.*found assets, metadata\.pt, optimizer\.pt"),
-        (without_statistics, r"no norm_stats\.json below.*--norm-stats FILE"),
-        (two_statistics, r"statistics of droid, physical-intelligence/libero; say which with --asset-id NAME"),
+        (without_weights, r"assets, metadata\.pt, optimizer\.pt"),
+        (without_statistics, r"norm_stats\.json.*--norm-stats FILE"),
+        (two_statistics, "droid, physical-intelligence/libero.*--asset-id NAME"),
     ],
 )
 def test_what_else_trainers_leave_is_said_with_the_next_step(
-    tmp_path, tokenizer, change: Callable[[Path], None], said: str
+    tmp_path, tokenizer, change: Callable[[Path], None], named: str
 ):
     """By capture, and by the doctor, which loads nothing."""
     folder = trained(tmp_path / "checkpoint")
     change(folder)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=named):
         build(folder, tokenizer, model_config=CASE)
     with pytest.raises(UserError):
         checkpoint_of("pi", *words_of(folder, tokenizer))
@@ -228,10 +228,10 @@ def test_cameras_are_chosen_by_name_on_both_sides(tmp_path, tokenizer, of):
     if lerobot:  # its own name of the feature means the same
         same = ("observation.images.front=robot0_eye_in_hand",)
         assert build(folder, tokenizer, model_config=CASE, camera=same).cameras == policy.cameras
-    for wrong, said in (
-        (["base=agentview"], f"Unknown camera of the policy 'base'.*{first}"),
-        ([f"{first}=frontview"], r"Unknown camera of the simulators 'frontview'.*agentview, robot0_eye_in_hand, none"),
-        ([f"{camera.name}=none" for camera in policy.cameras], "None of the policy's cameras"),
+    for wrong, named in (
+        (["base=agentview"], f"'base'.*{first}"),
+        ([f"{first}=frontview"], "'frontview'.*agentview, robot0_eye_in_hand, none"),
+        ([f"{camera.name}=none" for camera in policy.cameras], "--camera"),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=named):
             build(folder, tokenizer, model_config=CASE, camera=tuple(wrong))
