@@ -155,10 +155,12 @@ def test_words_have_what_their_keys_get_over_even_attention(store, recording, st
     assert frame.height
 
 
-def test_a_word_with_a_capital_letter_has_its_effect():
+def test_a_word_with_a_capital_letter_has_its_effect_and_one_that_comes_twice_a_number():
     effects = [{"item": "'lift'", "item_kind": "word", "effect": [0.5]}]
-    table, *_ = rrd_file._words((), SimpleNamespace(words=[[("Lift", 2.0)]]), effects, [0])
-    assert table.values["text"].splitlines()[2:] == ["| Lift | 2.00 | 0.50 |"]
+    words = [("Lift", 2.0), ("it", 1.0), ("it", 3.0)]
+    table, *series = rrd_file._words((), SimpleNamespace(words=[words]), effects, [0])
+    assert table.values["text"].splitlines()[2] == "| Lift | 2.00 | 0.50 |"
+    assert [one.place[-1] for one in series if one.kind == "Scalars"] == ["Lift", "it", "it (2)"]
 
 
 def test_a_full_disk_ends_it_and_leaves_nothing(tmp_path, store, rerun):
