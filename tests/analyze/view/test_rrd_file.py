@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 import vla_attention as va
+from tests.kit.archives import example_store
 from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import write_site_store
 from tests.kit.stores import StoreSpec, small_steps, write_store
@@ -184,6 +185,18 @@ def borders_of(inside: np.ndarray, shape: tuple[int, ...]) -> list[tuple[tuple[f
 
 
 def test_pictures_are_the_stored_ones_and_lines_go_around_what_gets_twice_even(store, episode, recording, starts):
+    hold_pictures(store, episode, recording, starts)
+
+
+def test_pictures_and_lines_of_a_mirrored_camera():
+    path = example_store("cubes")
+    (episode,) = [one for one in open_store(path).episodes if one.name == "task001_episode000"]
+    assert any(camera.mirrored for camera in open_store(path).attributes.policy.cameras)
+    steps = episode.read("env_step").astype(int)
+    hold_pictures(path, episode, as_logged(path, episode.name), (steps - steps[0]).tolist())
+
+
+def hold_pictures(store: Path, episode: StoredEpisode, recording: Recording, starts: list[int]) -> None:
     frame = va.open(store).overlay(episode=0, tasks=[1]).figures[0].frame
     views = {view.name: view for view in open_store(store).attributes.policy.cameras}
     drawn = 0
