@@ -188,12 +188,16 @@ def test_pictures_are_the_stored_ones_and_lines_go_around_what_gets_twice_even(s
     hold_pictures(store, episode, recording, starts)
 
 
-def test_pictures_and_lines_of_a_mirrored_camera():
+def test_pictures_of_a_mirrored_camera_and_the_mark_of_what_is_named():
     path = example_store("cubes")
     (episode,) = [one for one in open_store(path).episodes if one.name == "task001_episode000"]
     assert any(camera.mirrored for camera in open_store(path).attributes.policy.cameras)
     steps = episode.read("env_step").astype(int)
-    hold_pictures(path, episode, as_logged(path, episode.name), (steps - steps[0]).tolist())
+    recording = as_logged(path, episode.name)
+    hold_pictures(path, episode, recording, (steps - steps[0]).tolist())
+    marks = {entity: columns["Boxes3D:colors"][None] for entity, columns in recording.items() if "/mark" in entity}
+    unlike = [entity for entity, color in marks.items() if [*marks.values()].count(color) == 1]
+    assert (len(marks), unlike) == (3, ["/scene/green cube/mark"])
 
 
 def hold_pictures(store: Path, episode: StoredEpisode, recording: Recording, starts: list[int]) -> None:
