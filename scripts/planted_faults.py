@@ -146,8 +146,8 @@ FAULTS = (
     Fault(
         "picture turned",
         "capture/policies/pi/preprocess.py",
-        "np.ascontiguousarray(frame[::-1, ::-1])",
-        "np.ascontiguousarray(frame[::-1])",
+        "np.ascontiguousarray(picture[::-1, ::-1])",
+        "np.ascontiguousarray(picture[::-1])",
         ("tests/capture/policies/pi",),
     ),
     Fault(
