@@ -4,7 +4,7 @@
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        the gate: formatting, types, tests, and the package as others install it; minutes by part
 #   make test-thorough   attacks, damages, kills, memory, many examples, site and notebooks too (an hour or more)
-#   make faults      twenty faults planted one at a time: the tests of their area have to catch each
+#   make faults      29 faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot,
 #                    and .venv-lerobot06 of 5 GB, where there is a Python 3.12)
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)

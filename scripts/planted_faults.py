@@ -146,8 +146,8 @@ FAULTS = (
     Fault(
         "picture turned",
         "capture/policies/pi/preprocess.py",
-        "np.ascontiguousarray(frame[::-1, ::-1])",
-        "np.ascontiguousarray(frame[::-1])",
+        "np.ascontiguousarray(picture[::-1, ::-1])",
+        "np.ascontiguousarray(picture[::-1])",
         ("tests/capture/policies/pi",),
     ),
     Fault(
@@ -198,6 +198,55 @@ FAULTS = (
         "return self.store.has(job.task.task_id, job.episode_index)",
         "return False",
         ("tests/capture/engine", "tests/capture/rerun"),
+    ),
+    Fault(
+        "exchange: words of the sentence that was not told count as heard",
+        "analyze/core/exchanged.py",
+        'told, scene = words_by_kind(row["told"]), words_by_kind(row["scene_instruction"])',
+        'scene, told = words_by_kind(row["told"]), words_by_kind(row["scene_instruction"])',
+        (f"{CORE}/test_exchanged.py",),
+    ),
+    Fault(
+        "perturbed suites: a task weighs as much as it has episodes",
+        "analyze/core/perturbations.py",
+        'suites = tasks.group_by("suite").agg(pl.sum("num_episodes"), *means)',
+        'suites = rows.group_by("suite").agg(pl.len().alias("num_episodes"), *means)',
+        (f"{CORE}/test_perturbations.py",),
+    ),
+    Fault(
+        "courses: a replan's mean over the moments before its steps",
+        "analyze/core/courses.py",
+        "moments[begin + 1 : end + 1].mean()",
+        "moments[begin:end].mean()",
+        (f"{CORE}/test_courses.py",),
+    ),
+    Fault(
+        "attention elsewhere: an episode's own places count as other ones",
+        "analyze/core/object_maps.py",
+        "for name in _names(one)], axis=-1) - one.area",
+        "for name in _names(one)], axis=-1)",
+        (f"{CORE}/test_object_maps.py",),
+    ),
+    Fault(
+        "masked softmax: a query that its mask leaves no key sees all",
+        "capture/torch_policies/softmax_calls.py",
+        "(logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)",
+        "logits > highest + MASKED_BELOW",
+        ("tests/capture/torch_policies/test_softmax_calls.py",),
+    ),
+    Fault(
+        "effect of other noise: that of the first replan at every one",
+        "capture/effects/measurement.py",
+        "condition.noise.seed, context.task_id, context.episode_index, context.replan",
+        "condition.noise.seed, context.task_id, context.episode_index, 0",
+        ("tests/capture/effects/test_measurement.py",),
+    ),
+    Fault(
+        "recording for Rerun: turned with w first",
+        "analyze/view/rrd_file.py",
+        "np.roll(poses[:, i, 3:], -1, axis=1)",
+        "poses[:, i, 3:]",
+        ("tests/analyze/view/test_rrd_file.py",),
     ),
 )
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,9 +54,11 @@ if TYPE_CHECKING:
 
 SUFFIX = ".rrd"
 TIMELINE = "step"
+_MARKDOWN = "text/markdown"
 #: The oldest release that has every call below; LeRobot 0.4 takes it, too.
 OLDEST = (0, 24)
-#: Colours of the lines, the first around the larger part; half their width in pixels of the screen.
+#: Colours of the lines, the first around the larger part; half their width in pixels of the screen, which Rerun has as
+#: negative numbers.
 _LINES = ((0x00, 0xB5, 0xCC), (0xE0, 0x40, 0xA0))
 _WIDE = 1.2
 #: Curves that others are held against, and their colour, which light and dark viewers show.
@@ -112,37 +114,43 @@ def write_recordings(path: Path, store: Store, episodes: Sequence[StoredEpisode]
 
 
 @dataclass(frozen=True)
-class _Recording:
-    """A recording that is being written."""
+class Logged:
+    """What stands at an entity.
 
-    rr: Any
-    stream: rerun.RecordingStream
+    Attributes:
+        place: the parts of its path.
+        kind: a type of Rerun's.
+        values: its fields, by their names there; with several steps a row for each of them.
+        steps: at which it stands; None: throughout.
+    """
 
-    def log(self, parts: Sequence[str], what: Any, step: int | None = None) -> None:
-        """Log at a step; without one it holds throughout."""
-        if step is not None:
-            self.stream.set_time(TIMELINE, sequence=step)
-        self.stream.log(_path(self.rr, parts), what, static=step is None)
+    place: tuple[str, ...]
+    kind: str
+    values: Mapping[str, Any]
+    steps: int | Sequence[int] | None = None
 
-    def columns(self, parts: Sequence[str], steps: Iterable[int], columns: Any) -> None:
-        """Log a row for each step."""
-        self.stream.send_columns(_path(self.rr, parts), [self.rr.TimeColumn(TIMELINE, sequence=list(steps))], columns)
 
-    def series(self, parts: Sequence[str], steps: Sequence[int], curves: Mapping[str, Sequence[float | None]]) -> None:
-        """Log curves by their names below `parts`, a number a step; null and what is not finite are left out."""
-        colors = group_styles(list(curves))
-        for name, values in curves.items():
-            known = [
-                (step, value)
-                for step, value in zip(steps, values, strict=True)
-                if value is not None and math.isfinite(value)
-            ]
-            if not known:
-                continue
-            numbers = self.rr.Scalars.columns(scalars=[value for _, value in known])
-            self.columns([*parts, name], [step for step, _ in known], numbers)
-            color = _BASELINE_COLOR if name in _BASELINES else colors[name]["color"]
-            self.log([*parts, name], self.rr.SeriesLines(colors=[tuple(bytes.fromhex(color[1:]))], names=[name]))
+def logged(shown: ShownEpisode, about: Mapping[str, Any], effects: Sequence[Mapping[str, Any]]) -> Iterator[Logged]:
+    """Everything that a recording of an episode holds but for its arrangement.
+
+    about: of `ShownEpisode`; effects: of `shown_effects`, none where none was measured.
+    """
+    starts = about["starts"]
+    yield Logged(("about",), "TextDocument", {"text": _about(shown, about), "media_type": _MARKDOWN})
+    sites = [site.name for site in shown.store.attributes.sites]
+    for site in sites:
+        before = (site,) if len(sites) > 1 else ()
+        maps = episode_maps(shown.question(site), shown.item(site), seen_cameras(shown.item(site)))
+        yield from _pictures(before, shown, maps, starts)
+        yield from _words(before, maps, effects, starts)
+        yield from _groups(before, shown.groups(site, MEAN, MEAN), starts)
+    for kind in _kinds(effects):
+        curves = {item["item"]: item["effect"] for item in effects if item["item_kind"] == kind}
+        yield from _series(("effects", kind), starts, curves)
+    yield from _scene(shown)
+    yield from _actions(shown, about)
+    for event in about["events"]:
+        yield Logged(("events",), "TextLog", {"text": event["text"]}, event["step"])
 
 
 def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None) -> None:
@@ -151,31 +159,44 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None)
     stream = rr.RecordingStream("vla-attention", recording_id=f"{shown.store.run} {shown.episode.name}")
     if not rr.is_enabled(stream):
         raise BadArgument("Rerun is switched off by the environment variable RERUN; unset it.")
-    sites = [site.name for site in shown.store.attributes.sites]
-    effects = [] if units is None else _effects(shown, units)
-    kinds = dict.fromkeys(item["item_kind"] for item in effects)
+    effects = [] if units is None else shown_effects(shown, units)
     # To a full disk Rerun itself writes half a file, and says so in its log alone. Only an active blueprint is shown.
     memory = stream.memory_recording()
-    stream.send_blueprint(_blueprint(rr, about, kinds))
-    recording = _Recording(rr, stream)
+    stream.send_blueprint(_blueprint(rr, about, _kinds(effects)))
     stream.send_recording_name(f"{shown.store.suite}: {about['told'] or about['instruction']} ({shown.episode.name})")
-    recording.log(["about"], rr.TextDocument(_about(shown, about), media_type=rr.MediaType.MARKDOWN))
-    for site in sites:
-        before = [site] if len(sites) > 1 else []
-        question = shown.question(site)
-        maps = episode_maps(question, shown.item(site), seen_cameras(shown.item(site)))
-        _log_pictures(recording, before, shown, maps, about["starts"])
-        _log_words(recording, before, maps, effects, about["starts"])
-        _log_groups(recording, before, shown.groups(site, MEAN, MEAN), about["starts"])
-    for kind in kinds:
-        curves = {item["item"]: item["effect"] for item in effects if item["item_kind"] == kind}
-        recording.series(["effects", kind], about["starts"], curves)
-    _log_scene(recording, shown)
-    _log_actions(recording, shown, about)
-    for event in about["events"]:
-        recording.log(["events"], rr.TextLog(event["text"]), event["step"])
+    if about["courses"]:
+        stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for one in logged(shown, about, effects):
+        _log(rr, stream, one)
     path.write_bytes(memory.drain_as_bytes())
     stream.disconnect()
+
+
+def _log(rr: Any, stream: rerun.RecordingStream, one: Logged) -> None:
+    place, kind = _path(rr, one.place), getattr(rr, one.kind)
+    if isinstance(one.steps, Sequence):
+        times = rr.TimeColumn(TIMELINE, sequence=list(one.steps))
+        stream.send_columns(place, [times], kind.columns(**one.values))
+        return
+    if one.steps is not None:
+        stream.set_time(TIMELINE, sequence=one.steps)
+    stream.log(place, kind(**one.values), static=one.steps is None)
+
+
+def _series(
+    place: tuple[str, ...], steps: Sequence[int], curves: Mapping[str, Sequence[float | None]]
+) -> Iterator[Logged]:
+    """Curves by their names below a place, a number a step; null and what is not finite are left out."""
+    colors = group_styles(list(curves))
+    for name, values in curves.items():
+        pairs = zip(steps, values, strict=True)
+        known = [(step, value) for step, value in pairs if value is not None and math.isfinite(value)]
+        if known:
+            numbers = {"scalars": [value for _, value in known]}
+            yield Logged((*place, name), "Scalars", numbers, [step for step, _ in known])
+            color = _BASELINE_COLOR if name in _BASELINES else colors[name]["color"]
+            look = {"colors": [tuple(bytes.fromhex(color[1:]))], "names": [name]}
+            yield Logged((*place, name), "SeriesLines", look)
 
 
 def _about(shown: ShownEpisode, about: Mapping[str, Any]) -> str:
@@ -188,7 +209,7 @@ def _about(shown: ShownEpisode, about: Mapping[str, Any]) -> str:
     )
 
 
-def _effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, Any]]:
+def shown_effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, Any]]:
     """The effects of taking an item away, or of other words, and the noise; from all queries where both were tried."""
     found = shown.effects(units)
     items = [] if found is None else found["items"]
@@ -201,37 +222,34 @@ def _effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, Any]]:
     ]
 
 
-def _log_pictures(
-    recording: _Recording, before: Sequence[str], shown: ShownEpisode, maps: EpisodeMaps, starts: Sequence[int]
-) -> None:
+def _kinds(effects: Sequence[Mapping[str, Any]]) -> list[str]:
+    return list(dict.fromkeys(item["item_kind"] for item in effects))
+
+
+def _pictures(
+    before: tuple[str, ...], shown: ShownEpisode, maps: EpisodeMaps, starts: Sequence[int]
+) -> Iterator[Logged]:
     """What the policy got, with lines around the patches that get much more than even attention."""
-    rr = recording.rr
     lifts = [one.lift.ravel() for one in maps.cameras.values()]
     levels = line_levels(scale_end(np.concatenate(lifts))) if lifts else []
     for camera, one in maps.cameras.items():
-        place, grid = [*before, "pictures", camera], one.picture.grids[0]
+        place, grid = (*before, "pictures", camera), one.picture.grids[0]
         sides = float(grid.image_width), float(grid.image_height)
         for replan, step in enumerate(starts):
             if maps.has_frames(camera):
-                png = rr.EncodedImage(contents=shown.picture(camera, replan), media_type="image/png")
-                recording.log(place, png, step)
+                png = {"contents": shown.picture(camera, replan), "media_type": "image/png"}
+                yield Logged(place, "EncodedImage", png, step)
             lift = upright(one.lift[replan], one.view)
             for number, (level, color) in enumerate(zip(levels, _LINES, strict=False)):
                 around = borders(lift >= level, 0.1 * number, (0.0, 0.0), sides)
-                lines = [(one[:2], one[2:]) for one in around]
-                drawn = rr.LineStrips2D(lines, colors=[color], radii=rr.Radius.ui_points(_WIDE))
-                recording.log([*place, f"{level:g} times even"], drawn, step)
+                lines = {"strips": [(one[:2], one[2:]) for one in around], "colors": [color], "radii": -_WIDE}
+                yield Logged((*place, f"{level:g} times even"), "LineStrips2D", lines, step)
 
 
-def _log_words(
-    recording: _Recording,
-    before: Sequence[str],
-    maps: EpisodeMaps,
-    effects: Sequence[Mapping[str, Any]],
-    starts: Sequence[int],
-) -> None:
+def _words(
+    before: tuple[str, ...], maps: EpisodeMaps, effects: Sequence[Mapping[str, Any]], starts: Sequence[int]
+) -> Iterator[Logged]:
     """Every word's attention, as a series and in a table beside its effect; a word that comes twice has a number."""
-    rr = recording.rr
     effect_of = {item["item"].casefold(): item["effect"] for item in effects if item["item_kind"] == "word"}
     curves: dict[str, list[float | None]] = {}
     for replan, words in enumerate(maps.words):
@@ -244,45 +262,44 @@ def _log_words(
             tried = effect_of.get(f"'{text.casefold()}'")  # effects name words in lower case
             effect = None if tried is None else tried[replan]
             lines.append(f"| {text} | {lift:.2f} | {'' if effect is None else f'{effect:.2f}'} |")
-        table = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
-        recording.log([*before, "words"], table, starts[replan])
-    recording.series([*before, "attention"], starts, curves)
+        table = {"text": "\n".join(lines), "media_type": _MARKDOWN}
+        yield Logged((*before, "words"), "TextDocument", table, starts[replan])
+    yield from _series((*before, "attention"), starts, curves)
 
 
-def _log_groups(recording: _Recording, before: Sequence[str], groups: Mapping[str, Any], starts: Sequence[int]) -> None:
+def _groups(before: tuple[str, ...], groups: Mapping[str, Any], starts: Sequence[int]) -> Iterator[Logged]:
     """The ratio, and the mass of every group that has any: mean of the layers, which is the last one."""
     masses = {name: [line[-1] for line in group["mass"]] for name, group in groups["groups"].items()}
-    recording.series([*before, "masses"], starts, {name: values for name, values in masses.items() if any(values)})
+    yield from _series((*before, "masses"), starts, {name: values for name, values in masses.items() if any(values)})
     if groups["sides"]:
         ratios = {"ratio": groups["ratio"], "spread evenly": groups["uniform_ratio"]}
-        recording.series([*before, "ratio"], starts, {name: [line[-1] for line in of] for name, of in ratios.items()})
+        yield from _series((*before, "ratio"), starts, {name: [line[-1] for line in of] for name, of in ratios.items()})
 
 
-def _log_scene(recording: _Recording, shown: ShownEpisode) -> None:
+def _scene(shown: ShownEpisode) -> Iterator[Logged]:
     """Hand and objects where they were at every step; the hand with the axes of its own frame and its way."""
     steps = shown.episode.attributes.steps
     if steps is None:
         return
-    rr, poses = recording.rr, shown.episode.read(POSES).astype(np.float64)  # (moment, body, position and w, x, y, z)
-    recording.log(["scene"], rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    poses = shown.episode.read(POSES).astype(np.float64)  # (moment, body, position and w, x, y, z)
     for i, body in enumerate(steps.bodies):
         name = visible(body.replace("_", " "))
         turned = np.roll(poses[:, i, 3:], -1, axis=1)  # Rerun has w last
-        moved = rr.Transform3D.columns(translation=poses[:, i, :3], quaternion=turned)
-        recording.columns(["scene", name], range(len(poses)), moved)
+        moved = {"translation": poses[:, i, :3], "quaternion": turned}
+        yield Logged(("scene", name), "Transform3D", moved, range(len(poses)))
         if body == HAND:
-            axes = rr.Arrows3D(vectors=np.eye(3) * _AXES, colors=_AXIS_COLORS, radii=_AXES / 16)
-            recording.log(["scene", name, "axes"], axes)
-            way = rr.LineStrips3D([poses[:, i, :3]], colors=[(0x88, 0x88, 0x88)], radii=_AXES / 40)
-            recording.log(["scene", "way of the hand"], way)
+            axes = {"vectors": np.eye(3) * _AXES, "colors": _AXIS_COLORS, "radii": _AXES / 16}
+            yield Logged(("scene", name, "axes"), "Arrows3D", axes)
+            way = {"strips": [poses[:, i, :3]], "colors": [(0x88, 0x88, 0x88)], "radii": _AXES / 40}
+            yield Logged(("scene", "way of the hand"), "LineStrips3D", way)
         else:
             named = body in shown.named
             color = (0xE6, 0x9F, 0x00) if named else (0x99, 0x99, 0x99)
-            label = name + " (named)" * named
-            recording.log(["scene", name, "mark"], rr.Boxes3D(half_sizes=[_MARK] * 3, colors=[color], labels=[label]))
+            mark = {"half_sizes": [_MARK] * 3, "colors": [color], "labels": [name + " (named)" * named]}
+            yield Logged(("scene", name, "mark"), "Boxes3D", mark)
 
 
-def _log_actions(recording: _Recording, shown: ShownEpisode, about: Mapping[str, Any]) -> None:
+def _actions(shown: ShownEpisode, about: Mapping[str, Any]) -> Iterator[Logged]:
     """Every executed action; of a loop that is not ours the chunks' actions up to the next replan."""
     steps: Sequence[int]
     names: Sequence[str]
@@ -299,7 +316,7 @@ def _log_actions(recording: _Recording, shown: ShownEpisode, about: Mapping[str,
     else:
         return
     curves = {name: values.astype(float).tolist() for name, values in zip(names, actions.T, strict=True)}
-    recording.series(["actions"], steps, curves)
+    yield from _series(("actions",), steps, curves)
 
 
 def _blueprint(rr: Any, about: Mapping[str, Any], kinds: Collection[str]) -> Any:

@@ -1,10 +1,11 @@
-"""`vla-attention view --rrd`: what Rerun's own reader finds in a recording, against the store and the analysis."""
+"""`vla-attention view --rrd`: what is logged, and what Rerun's own reader finds of it, against store and analysis."""
 
 from __future__ import annotations
 
 import io
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,11 +17,14 @@ import pytest
 from PIL import Image
 
 import vla_attention as va
+from tests.kit.archives import example_store
 from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import write_site_store
 from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.view import rrd_file
+from vla_attention.analyze.view.episode_answers import ShownEpisode
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 
 SPEC = StoreSpec(tasks=(0, 1), replans=3, plant_effects=planted_effects(), plant_steps=small_steps)
@@ -49,10 +53,13 @@ def rerun() -> Any:
     return pytest.importorskip("rerun", reason="rerun-sdk is half a gigabyte: make test-rerun")
 
 
-def logged(path: Path) -> dict[str, dict[str, dict[int | None, Any]]]:
+Recording = dict[str, dict[str, dict[int | None, Any]]]
+
+
+def read_again(path: Path) -> Recording:
     """Entity -> column -> step (None: throughout) -> what was logged there; Rerun's reader has read it."""
     reader = pytest.importorskip("rerun.chunk", reason="only newer releases of rerun-sdk have this reader")
-    found: dict[str, dict[str, dict[int | None, Any]]] = {}
+    found: Recording = {}
     for chunk in reader.RrdReader(path).stream().to_chunks():
         read = chunk.to_record_batch()
         batch = {name: read.column(name).to_pylist() for name in read.schema.names if name != "log_time"}
@@ -63,11 +70,31 @@ def logged(path: Path) -> dict[str, dict[str, dict[int | None, Any]]]:
     return found
 
 
-@pytest.fixture(scope="module")
-def recording(store, rerun, tmp_path_factory) -> dict[str, dict[str, dict[int | None, Any]]]:
+def as_logged(path: Path, name: str) -> Recording:
+    """The same of what is given to Rerun: a value is a list, as a reader has it, unless it is one already."""
+    store, found = open_store(path), Recording()
+    (episode,) = [one for one in store.episodes if one.name == name]
+    shown = ShownEpisode(store, episode)
+    units = units_of_recorded(store) if episode.attributes.effects else None
+    effects = [] if units is None else rrd_file.shown_effects(shown, units)
+    for one in rrd_file.logged(shown, shown.about(), effects):
+        for field, values in one.values.items():
+            column = found.setdefault("/" + "/".join(one.place), {}).setdefault(f"{one.kind}:{field}", {})
+            if isinstance(one.steps, Sequence):
+                column.update((step, [value]) for step, value in zip(one.steps, values, strict=True))
+            else:
+                column[one.steps] = values if field in ("strips", "colors", "labels") else [values]
+    return found
+
+
+@pytest.fixture(scope="module", params=["logged", "read"])
+def recording(request, store, tmp_path_factory) -> Recording:
+    if request.param == "logged":
+        return as_logged(store, "task001_episode000")
+    request.getfixturevalue("rerun")
     path = tmp_path_factory.mktemp("recorded") / "one.rrd"
     assert main(["view", str(store), "--rrd", str(path), "--task", "1", "--episode", "0"]) == 0
-    return logged(path)
+    return read_again(path)
 
 
 @pytest.fixture
@@ -129,13 +156,12 @@ def test_words_have_what_their_keys_get_over_even_attention(store, recording, st
     assert frame.height
 
 
-def test_a_word_with_a_capital_letter_has_its_effect():
-    texts: list[str] = []
-    rr = SimpleNamespace(TextDocument=lambda text, **_: text, MediaType=SimpleNamespace(MARKDOWN=""))
-    recording = SimpleNamespace(rr=rr, log=lambda _, text, __: texts.append(text), series=lambda *_: None)
+def test_a_word_with_a_capital_letter_has_its_effect_and_one_that_comes_twice_a_number():
     effects = [{"item": "'lift'", "item_kind": "word", "effect": [0.5]}]
-    rrd_file._log_words(recording, [], SimpleNamespace(words=[[("Lift", 2.0)]]), effects, [0])  # type: ignore[arg-type]
-    assert texts[0].splitlines()[2:] == ["| Lift | 2.00 | 0.50 |"]
+    words = [("Lift", 2.0), ("it", 1.0), ("it", 3.0)]
+    table, *series = rrd_file._words((), SimpleNamespace(words=[words]), effects, [0])
+    assert table.values["text"].splitlines()[2] == "| Lift | 2.00 | 0.50 |"
+    assert [one.place[-1] for one in series if one.kind == "Scalars"] == ["Lift", "it", "it (2)"]
 
 
 def test_a_full_disk_ends_it_and_leaves_nothing(tmp_path, store, rerun):
@@ -145,22 +171,50 @@ def test_a_full_disk_ends_it_and_leaves_nothing(tmp_path, store, rerun):
     assert not [*tmp_path.iterdir()]
 
 
+def borders_of(inside: np.ndarray, shape: tuple[int, ...]) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """The sides (x, y) to (x, y) of patches in pixels that part one inside from one outside."""
+    wide, high = shape[1] / inside.shape[1], shape[0] / inside.shape[0]
+    padded, found = np.pad(inside, 1), []
+    for row, column in np.ndindex(padded.shape[0] - 1, padded.shape[1] - 1):
+        corner, here = (round(column * wide, 3), round(row * high, 3)), padded[row + 1, column + 1]
+        if here != padded[row + 1, column]:
+            found.append((corner, (corner[0], round((row + 1) * high, 3))))
+        if here != padded[row, column + 1]:
+            found.append((corner, (round((column + 1) * wide, 3), corner[1])))
+    return found
+
+
 def test_pictures_are_the_stored_ones_and_lines_go_around_what_gets_twice_even(store, episode, recording, starts):
+    hold_pictures(store, episode, recording, starts)
+
+
+def test_pictures_of_a_mirrored_camera_and_the_mark_of_what_is_named():
+    path = example_store("cubes")
+    (episode,) = [one for one in open_store(path).episodes if one.name == "task001_episode000"]
+    assert any(camera.mirrored for camera in open_store(path).attributes.policy.cameras)
+    steps = episode.read("env_step").astype(int)
+    recording = as_logged(path, episode.name)
+    hold_pictures(path, episode, recording, (steps - steps[0]).tolist())
+    marks = {entity: columns["Boxes3D:colors"][None] for entity, columns in recording.items() if "/mark" in entity}
+    colored = [entity for entity, [color] in marks.items() if len({*color}) > 1]
+    assert (len(marks), colored) == (3, ["/scene/green cube/mark"])
+
+
+def hold_pictures(store: Path, episode: StoredEpisode, recording: Recording, starts: list[int]) -> None:
     frame = va.open(store).overlay(episode=0, tasks=[1]).figures[0].frame
     views = {view.name: view for view in open_store(store).attributes.policy.cameras}
     drawn = 0
     for row in frame.iter_rows(named=True):
         camera, step = row["camera"], starts[row["replan"]]
-        blob = recording[f"/pictures/{camera}"]["EncodedImage:blob"][step][0]
+        columns = recording[f"/pictures/{camera}"]
+        blob = (columns.get("EncodedImage:blob") or columns["EncodedImage:contents"])[step][0]
         stored = episode.read(f"frames/{camera}", row["replan"])
         down, across = (1 if views[camera].upright else -1), (-1 if views[camera].mirrored else 1)
         picture = np.asarray(Image.open(io.BytesIO(bytes(blob))))
         np.testing.assert_array_equal(picture, stored[::down, ::across])
-        inside = np.pad(np.array(row["map"]) >= 2, 1)
-        borders = (inside[1:] != inside[:-1]).sum() + (inside[:, 1:] != inside[:, :-1]).sum()
         strips = recording[f"/pictures/{camera}/2 times even"]["LineStrips2D:strips"].get(step, [])
-        assert len(strips) == borders
-        assert all(0 <= x <= picture.shape[1] and 0 <= y <= picture.shape[0] for strip in strips for x, y in strip)
+        found = sorted(tuple(sorted((round(float(x), 3), round(float(y), 3)) for x, y in strip)) for strip in strips)
+        assert found == sorted(borders_of(np.array(row["map"]) >= 2, picture.shape))
         drawn += len(strips)
     assert drawn
 
@@ -177,9 +231,32 @@ def test_hand_objects_actions_and_events_are_those_of_the_steps(episode, recordi
     for name, executed in zip(
         ("x", "y", "z", "turn x", "turn y", "turn z", "gripper"), episode.read("steps/actions").T, strict=True
     ):
-        assert list(actions[name].values()) == pytest.approx(executed.tolist())
+        assert actions[name] == pytest.approx(dict(enumerate(executed.tolist())))
     events = {step: text[0] for step, text in recording["/events"]["TextLog:text"].items()}
     assert events[steps.first_touch[1]].startswith("touches")
+
+
+def test_returned_actions_stand_up_to_the_next_call_and_the_end(tmp_path):
+    path = write_store(tmp_path / "a.zarr", tasks=(0,))
+    episode = open_store(path).episodes[1]
+    chunks, num_steps = episode.read("actions"), episode.attributes.num_steps
+    assert num_steps < chunks.shape[0] * chunks.shape[1]
+    found = curves(as_logged(path, episode.name), "actions")
+    for dimension in range(chunks.shape[2]):
+        expected = {step: chunks[step // 5, step % 5, dimension] for step in range(num_steps)}
+        assert found[str(dimension)] == pytest.approx(expected)
+
+
+def test_sites_stand_apart(tmp_path):
+    path = write_site_store(tmp_path / "a.zarr", kind="alternating", tasks=(0,), episodes=1)
+    found = as_logged(path, "task000_episode000")
+    for site in ("self", "cross"):
+        groups = va.open(path).analyze(by="replan", site=site)["replans_groups"].lazy()
+        masses = curves(found, f"{site}/masses")
+        for name, values in masses.items():
+            own = groups.filter(layer="layers_avg", group=name).sort("replan").select("mass").collect()
+            assert list(values.values()) == pytest.approx(own["mass"].to_list())
+        assert masses
 
 
 @pytest.mark.parametrize("kind", ["alternating", "split", "growing"])

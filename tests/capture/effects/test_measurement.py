@@ -84,7 +84,8 @@ def lengths_differ(policy, given, condition, context) -> bool:
 def test_every_effect_is_that_of_a_single_call(name):
     policy = policy_named(name)
     run = measurement(policy, ("text", "cameras", "objects", "tokens"), ("all", "action", "pictures", "text"))
-    given, context, actions = call_of(policy)
+    # Noise and random keys are drawn anew for every replan.
+    given, context, actions = call_of(policy, replan=3)
     effects = run.begin().measure(given, 11, actions, context)
     names = [condition.name for condition in effects.conditions]
     assert len(set(names)) == len(names)
@@ -165,7 +166,7 @@ def by_hand_in_one_step(policy, given, context):
 def test_cosmos_is_called_once_for_each_condition():
     policy = policy_named("cosmos")
     given = policy.prepare(make_observation(0), INSTRUCTION)
-    context = CallContext(0, 2, 0)
+    context = CallContext(0, 2, 3)
     actions = policy.act(given, 11)
     run = EffectMeasurement(policy, planned_effects(EffectSettings(("text", "cameras")), policy, 3), {}, print)
     effects = run.begin().measure(given, 11, actions, context)
@@ -175,11 +176,11 @@ def test_cosmos_is_called_once_for_each_condition():
         condition = effects.conditions[number]
         tokens = site_tokens(policy.sites, given.key_role, given.prompt, (), {})
         names = run_vocabularies(policy.sites, [given.prompt.instruction_text], ())
-        editors = make_editors(condition, tokens, names, ReplanPlace(0, 2, 0)) if condition.keys else None
+        editors = make_editors(condition, tokens, names, ReplanPlace(0, 2, 3)) if condition.keys else None
         inputs = given
         if condition.changes_input:
             inputs = policy.prepare_again(changed_inputs(given.given, condition, policy.sites, context))
-        seed = 11 if condition.noise is None else policy.replan_noise_seed(condition.noise.seed, 0, 2, 0)
+        seed = 11 if condition.noise is None else policy.replan_noise_seed(condition.noise.seed, 0, 2, 3)
         expected = policy.act(inputs, seed, None, editors) - actions
         np.testing.assert_allclose(change * effects.units, expected, atol=1e-6, err_msg=condition.name)
 

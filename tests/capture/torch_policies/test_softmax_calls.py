@@ -189,6 +189,41 @@ def test_a_change_takes_keys_away(attend):
     left[:, 1, :, 3] = 0
     torch.testing.assert_close(second.rows[1], left / left.sum(-1, keepdim=True), rtol=1e-5, atol=1e-6)
     assert max(second.errors) < 5e-6
+    assert torch.equal(first.allowed[1], second.allowed[1])
+
+
+@pytest.mark.parametrize("attend", [plain, grouped, transposed, queries_before_heads])
+@pytest.mark.parametrize("low", [-1e9, torch.finfo(torch.float32).min])
+def test_a_mask_of_each_head_may_leave_a_query_nothing(attend, low):
+    """What a query sees is told by its own highest logit: here another query has higher and far lower ones."""
+    torch.manual_seed(2)
+    policy = Policy(attend, heads=4, kv_heads=2).eval().requires_grad_(False)
+    keep = torch.rand(2, 4, 5, 7) < 0.6
+    keep[0, 1, 2] = keep[1, 3, 0] = False
+    mask = torch.zeros(keep.shape).masked_fill(~keep, low)
+    mask[:, :, 1], mask[:, :, 3] = mask[:, :, 1] - 3000, mask[:, :, 3] + 3000
+    seen = Seen()
+    with watch_attention(policy, seen):
+        policy(torch.randn(2, 5, 32), torch.randn(2, 7, 32), mask)
+    for rows, allowed in zip(seen.rows, seen.allowed, strict=True):
+        assert torch.equal(allowed.expand(keep.shape), keep)
+        some = keep.any(-1, keepdim=True)
+        assert (rows[~keep & some] == 0).all()
+        torch.testing.assert_close(rows.sum(-1), torch.ones(2, 4, 5), rtol=0, atol=2e-6)
+    assert max(seen.errors) < 5e-6
+
+
+def test_a_query_without_a_key_has_an_empty_row():
+    torch.manual_seed(3)
+    policy = Policy(masked_afterwards).eval().requires_grad_(False)
+    keep = torch.ones(1, 1, 5, 7, dtype=torch.bool)
+    keep[..., 2, :] = False
+    seen = Seen()
+    with watch_attention(policy, seen):
+        policy(torch.randn(1, 5, 32), torch.randn(1, 7, 32), torch.zeros(keep.shape).masked_fill(~keep, -math.inf))
+    for rows, allowed in zip(seen.rows, seen.allowed, strict=True):
+        assert torch.equal(allowed.expand(1, 4, 5, 7), keep.expand(1, 4, 5, 7))
+        torch.testing.assert_close(rows.sum(-1), keep.any(-1).expand(1, 4, 5).float(), rtol=0, atol=2e-6)
 
 
 def test_probabilities_that_are_changed_before_the_product():
