@@ -28,6 +28,7 @@ from tests.kit.paths import GOLDEN, ROOT
 from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.published.parse_results import build_parser as parser_of_results
 from vla_attention.analyze.published.parse_results import main as parse_attention_ratio_results
+from vla_attention.analyze.render import figures
 from vla_attention.analyze.render.style import Style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
 from vla_attention.capture.policies.families import policy_families
@@ -150,6 +151,7 @@ def _asked(program: Callable[[list[str]], int], words: list[str], folder: Path) 
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(Style, "content", lambda *_: b"")
+        patch.setattr(figures, "content", lambda _figure, _style, kinds: ([b""] * len(kinds), 1.0))
         assert program(words) == 0
     return dict(_read(folder / "results"))
 
