@@ -11,6 +11,7 @@ from msgspec import structs
 
 from tests.kit.planted_effects import planted_effects
 from tests.kit.stores import StoreSpec, write_store
+from tests.kit.thorough import thorough_except
 from tests.kit.tokens import small_tokens
 from vla_attention.analyze.__main__ import main
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
@@ -70,16 +71,19 @@ def stores(tmp_path_factory):
     return made
 
 
-@pytest.mark.parametrize(
-    ("kind", "command"),
-    [
-        *(("cut", command) for command in COMMANDS),
-        *(("told", command) for command in ("language", "list", "view", "compare")),
-        *(("replaced", command) for command in ("analyze", "list", "effects", "compare")),
-        *(("knocked out", command) for command in ("analyze", "words", "by", "report")),
-        *(("neither", command) for command in ("analyze", "list")),
-    ],
-)
+#: Every command once, and every kind of run with one of them.
+GATE = [("cut", command) for command in COMMANDS]
+GATE += [("told", "list"), ("replaced", "list"), ("knocked out", "analyze"), ("neither", "analyze")]
+CASES = [
+    *GATE,
+    *(("told", command) for command in ("language", "view", "compare")),
+    *(("replaced", command) for command in ("analyze", "effects", "compare")),
+    *(("knocked out", command) for command in ("words", "by", "report")),
+    ("neither", "list"),
+]
+
+
+@pytest.mark.parametrize(("kind", "command"), thorough_except(GATE, CASES, several=True))
 def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, command):
     monkeypatch.setattr("vla_attention.analyze.view.server.ViewerServer.serve_forever", lambda self: None)
     words = ["analyze" if command in ("list", "by") else command]
