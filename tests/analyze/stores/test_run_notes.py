@@ -74,7 +74,7 @@ def stores(tmp_path_factory):
 @pytest.mark.parametrize(
     ("kind", "command"),
     thorough_except(
-        [("cut", "words"), ("cut", "view"), ("told", "compare"), ("knocked out", "report"), ("neither", "list")],
+        [("cut", "words"), ("cut", "view"), ("told", "compare"), ("replaced", "list"), ("neither", "list")],
         [
             *(("cut", command) for command in COMMANDS),
             *(("told", command) for command in ("language", "list", "view", "compare")),

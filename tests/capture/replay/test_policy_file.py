@@ -105,24 +105,21 @@ def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
     assert re.search("replan_steps .*2,.* 1", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize(
-    ("content", "options", "named"),
-    [
-        (None, (), "my_policy.py"),
-        ("def load(device): return 3", (), "va.datasets.ReplayPolicy"),
-        (FILE, ("--camera", "top=front"), "'top'"),
-        (FILE, ("--knockout", "camera:top"), "top"),
-    ],
-)
-def test_mistakes_are_named(tmp_path, data, capsys, content, options, named):
-    file = tmp_path / "my_policy.py"
-    if content is not None:
-        file.write_text(content)
-    try:
-        code = run("replay", data, "--policy", file, "--output", tmp_path / "replay.zarr", *options)
-    except SystemExit as end:  # argparse's own
-        code = end.code
-    assert code == 2
-    error = capsys.readouterr().err
-    assert named in error
-    assert "Traceback" not in error
+def test_mistakes_are_named(tmp_path, data, capsys):
+    for name, content, options, named in (
+        ("none.py", None, (), "none.py"),
+        ("number.py", "def load(device): return 3", (), "va.datasets.ReplayPolicy"),
+        ("camera.py", FILE, ("--camera", "top=front"), "'top'"),
+        ("knockout.py", FILE, ("--knockout", "camera:top"), "top"),
+    ):
+        file = tmp_path / name
+        if content is not None:
+            file.write_text(content)
+        try:
+            code = run("replay", data, "--policy", file, "--output", tmp_path / "replay.zarr", *options)
+        except SystemExit as end:  # argparse's own
+            code = end.code
+        assert code == 2, name
+        error = capsys.readouterr().err
+        assert named in error, name
+        assert "Traceback" not in error

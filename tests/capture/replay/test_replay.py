@@ -174,24 +174,21 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
     np.testing.assert_array_equal(changed["dataset_actions"][:], base["dataset_actions"][:])
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
+def test_mistakes_end_with_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = made_up_episodes((3, 3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
+    data = write_data_set(tmp_path / "data", "v2.1", made)
+    for options, named in (
         (["--episode", 3], r"\b3; .* 0 to 2"),
         (["--camera", "base=image"], "'base'.*'base_0_rgb'"),
         (["--camera", "base_0_rgb=front"], "'data' 'front'"),
         (["--policy", "smolvla"], "--policy smolvla; .*pi"),
-    ],
-)
-def test_mistakes_end_with_one_line(tmp_path, capsys, monkeypatch, options, named):
-    monkeypatch.chdir(tmp_path)
-    made = made_up_episodes((3, 3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
-    data = write_data_set(tmp_path / "data", "v2.1", made)
-    assert run("replay", data, *TINY, "--output", "replay.zarr", *options) == 2
-    error = capsys.readouterr().err
-    assert re.search(named, error)
-    assert error.startswith("vla-capture: ")
-    assert "Traceback" not in error
+    ):
+        assert run("replay", data, *TINY, "--output", "replay.zarr", *options) == 2
+        error = capsys.readouterr().err
+        assert re.search(named, error)
+        assert error.startswith("vla-capture: ")
+        assert "Traceback" not in error
     assert not list(tmp_path.rglob("*.zarr"))
 
 
