@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,14 @@ DUMMY = (
     "--num-envs",
     "1",  # a simulator in a process of its own imports everything again
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _whether_anything_is_drawn_is_not_asked() -> Iterator[None]:
+    """tests/capture/environments/test_drawing.py does; each time a new process imports everything and draws."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import pytest
 import zarr
 
 from tests.end_to_end.written_tables import written_steps
+from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 
@@ -87,7 +88,8 @@ def test_each_site_is_analysed_by_itself(cosmos_store, tmp_path, capsys):
     assert "--site" in capsys.readouterr().err
 
 
-def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):
+def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path, monkeypatch):
+    capture_without_simulator(monkeypatch)
     assert (
         capture([*ONE_LAYER, "--output-dir", str(tmp_path), "--visual-frame", "curr_last", "--text-frame", "frame0"])
         == 0
