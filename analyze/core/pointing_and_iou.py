@@ -16,6 +16,11 @@ Floats = NDArray[np.float64]
 Masks = NDArray[np.bool_]
 
 
+#: What is not lower by more than this factor is as high. Stored rows have few bits, so that patches of a map are often
+#: equal; the last bits of their means are those of the processor, and decide nothing.
+_AS_HIGH = 1 - 1e-5
+
+
 def patch_centres(rows: int, columns: int) -> Floats:
     """Row and column of every patch's centre in patch units from the picture's top left corner, shape (patch, 2)."""
     row, column = np.divmod(np.arange(rows * columns), columns)
@@ -43,7 +48,7 @@ def distance_in_pictures(first: Floats, second: Floats, rows: int, columns: int)
 
 def object_masks(coverage: NDArray[np.floating], least: float) -> Masks:
     """Patches of which an object covers at least the share `least`, of the same shape as the coverage."""
-    return np.asarray(coverage >= least)
+    return np.asarray(coverage >= least * _AS_HIGH)
 
 
 def near_patches(rows: int, columns: int, tolerance: float) -> Masks:
@@ -73,7 +78,7 @@ def pointing_hits(maps: NDArray[np.floating], masks: Masks | NDArray[np.float32]
     Returns:
         (replan, ..., item); NaN where the item has no patch.
     """
-    highest = (maps == maps.max(axis=-1, keepdims=True)).astype(np.float32)
+    highest = (maps >= maps.max(axis=-1, keepdims=True) * _AS_HIGH).astype(np.float32)
     hits = _over_patches(highest / highest.sum(axis=-1, keepdims=True), masks)
     there = mask_sizes(masks) > 0
     return np.where(_over_replans(there, hits.ndim), hits, np.nan)
@@ -85,7 +90,7 @@ def regions_of_percentiles(maps: NDArray[np.floating], percentiles: Sequence[flo
     Of 256 patches that is 26 at 90 and 52 at 80; of a constant map it is all.
     """
     limits = np.percentile(maps, list(percentiles), axis=-1, keepdims=True)
-    return [np.asarray(maps >= limit) for limit in limits]
+    return [np.asarray(maps >= limit * _AS_HIGH) for limit in limits]
 
 
 def mask_sizes(masks: Masks | NDArray[np.float32]) -> Floats:

@@ -14,8 +14,6 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render import figures, page
 from vla_attention.analyze.render.style import Style
 
 HERE, DRAW = Path(__file__).parent, Style.content
@@ -30,7 +28,7 @@ def blank(_style: Style, _canvas: Any, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-def blank_figure(_figure: Figure, style: Style, kinds: Sequence[str]) -> tuple[list[bytes], float]:
+def blank_figure(_figure: Any, style: Style, kinds: Sequence[str]) -> tuple[list[bytes], float]:
     return [blank(style, None, kind) for kind in kinds], style.width(wide=False)
 
 
@@ -48,6 +46,6 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
         if item.path.is_relative_to(HERE) and not (thorough and drawn):
             patch.setattr(Style, "content", draw_quickly if thorough or drawn else blank)
             if not (thorough or drawn):
-                for module in (figures, page):
-                    patch.setattr(module, "content", blank_figure)
+                for module in ("figures", "page"):
+                    patch.setattr(f"vla_attention.analyze.render.{module}.content", blank_figure)
         return (yield)

@@ -34,4 +34,4 @@ def test_plain_zarr_finds_what_is_expected(tmp_path, spec):
                 np.testing.assert_array_equal(np.array(group.attrs[name], dtype=values.dtype), values, err_msg=name)
                 continue
             assert group[name].dtype == values.dtype, name
-            np.testing.assert_array_equal(group[name][:], values, err_msg=name)
+            np.testing.assert_allclose(group[name][:], values, rtol=2e-7 if name == "joint/atoms" else 0, err_msg=name)

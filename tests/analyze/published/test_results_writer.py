@@ -124,9 +124,10 @@ def test_numbers_are_those_of_the_table():
     result = next(item for item in results if (item.task_id, item.episode_idx) == (1, 2))
     steps = result.per_step_ratios["layer_25"]
     ratio = part["ratio"].to_numpy()
-    assert [step.visual_linguistic_ratio for step in steps] == [x if np.isfinite(x) else None for x in ratio]
-    assert [step.visual_mass for step in steps] == part["visual_mass"].to_list()
-    assert [step.action_fraction for step in steps] == part["action_fraction"].to_list()
+    ratios = [np.inf if (found := step.visual_linguistic_ratio) is None else found for step in steps]
+    assert ratios == pytest.approx(ratio.tolist())
+    assert [step.visual_mass for step in steps] == pytest.approx(part["visual_mass"].to_list())
+    assert [step.action_fraction for step in steps] == pytest.approx(part["action_fraction"].to_list())
     summary = result.summary["layer_25"]
     finite = ratio[np.isfinite(ratio)]
     assert summary.visual_linguistic_ratio.mean == pytest.approx(finite.mean())

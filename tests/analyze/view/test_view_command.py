@@ -38,7 +38,7 @@ def test_the_summary_has_the_numbers_of_the_analysis(store):
     expected = va.open(store).analyze()["episodes"].filter(layer="layers_avg").sort("task_id", "episode_index")
     for found, row in zip(document["episodes"], expected.iter_rows(named=True), strict=True):
         assert found["name"] == f"task{row['task_id']:03d}_episode{row['episode_index']:03d}"
-        assert (found["ratio"], found["lift"]) == (row["geometric_mean"], row["ratio_lift"])
+        assert [found["ratio"], found["lift"]] == pytest.approx([row["geometric_mean"], row["ratio_lift"]])
 
 
 def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):

@@ -112,8 +112,8 @@ def test_what_is_cut_is_stored_for_each_entry():
     assert not cut["unchanged"].any()
     assert not cut["noise"].any()
     (span,) = policy.sites[0].camera_spans(policy.cameras[0].name)
-    np.testing.assert_array_equal(
-        cut["without_object_red_cube"][span.start : span.stop], context.coverage[policy.cameras[0].name][:, 0]
+    np.testing.assert_allclose(
+        cut["without_object_red_cube"][span.start : span.stop], context.coverage[policy.cameras[0].name][:, 0], 1e-6
     )
     words = [row for name, row in cut.items() if name.startswith("without_word")]
     largest = max(int(row.sum()) for row in words)
