@@ -3,7 +3,7 @@
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        the gate: formatting, types, tests, and the package as others install it; minutes by part
-#   make test-thorough   attacks, damages, kills, memory, many examples, site and notebooks too (an hour or more)
+#   make test-thorough   attacks, damages, kills, memory, other last bits, many examples, site and notebooks (an hour or more)
 #   make faults      29 faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot,
 #                    and .venv-lerobot06 of 5 GB, where there is a Python 3.12)
@@ -71,9 +71,11 @@ check: .venv/capture-installed
 unit: .venv/capture-installed
 	$(PYTEST) $(ARGS)
 
-# For changes of formulas, file formats and readers, and before a release. With ten times as many random examples.
+# For changes of formulas, file formats and readers, and before a release. With ten times as many random examples; then
+# once more as on another processor.
 test-thorough: .venv/capture-installed
 	$(PYTEST) --thorough --hypothesis-profile thorough $(ARGS)
+	$(PYTEST) --jitter=1 $(ARGS)
 	$(MAKE) docs notebooks
 
 # In copies of the checkout, two at a time; a quarter of an hour. ARGS=NAME plants one.
