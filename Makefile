@@ -75,7 +75,7 @@ unit: .venv/capture-installed
 # once more as on another processor.
 test-thorough: .venv/capture-installed
 	$(PYTEST) --thorough --hypothesis-profile thorough $(ARGS)
-	$(PYTEST) --jitter=1 $(ARGS)
+	$(PYTEST) --jitter $(ARGS)
 	$(MAKE) docs notebooks
 
 # In copies of the checkout, two at a time; a quarter of an hour. ARGS=NAME plants one.

@@ -50,14 +50,14 @@ if _MEMORY.is_dir() and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMOR
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="run what make test-thorough runs too")
-    parser.addoption("--jitter", nargs="?", const="0", metavar="SEED", help="change last bits: see tests/kit/jitter")
+    parser.addoption("--jitter", action="store_true", help="change the last bits of sums: see tests/kit/jitter")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     # `-m thorough`, alone or in an expression, asks for these tests as well.
     config.option.thorough = config.option.thorough or "thorough" in config.option.markexpr
-    if config.option.jitter is not None:
-        jitter.switch_on(config.option.jitter)
+    if config.option.jitter:
+        jitter.switch_on()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

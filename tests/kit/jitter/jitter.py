@@ -1,6 +1,6 @@
 """What another processor does, on this one: every product, sum, exponential and logarithm differs in its last bits.
 
-    pytest --jitter [SEED]
+    pytest --jitter tests/analyze           # VLA_JITTER=2 gives other last bits
 
 A library picks its kernels by processor, length and memory, so the last bits of what it adds up are promised to nobody.
 Here they change by a factor that a seed and the place in an array of this shape and kind decide. The same work twice
@@ -38,14 +38,14 @@ ADD_UP = {"sum", "mean", "std", "var", "dot", "matmul", "einsum", "tensordot", "
 CURVES = {"exp", "expm1", "log", "log1p", "log2", "log10", "power", "tanh", "sin", "cos", "arctan2", "arccos"}
 
 
-def switch_on(seed: str) -> None:
+def switch_on() -> None:
     """Before anything of the package that computes is loaded."""
     loaded = {name: module.__file__ for name, module in sys.modules.items() if _is_changed(name)}
     early = [name for name, file in loaded.items() if file and "_jittered" in ast.unparse(_changed_tree(file))]
     assert not early, f"loaded too early to be changed: {early}"
     assert "torch" not in sys.modules
     here = Path(__file__).parent
-    os.environ[SEED] = seed
+    os.environ.setdefault(SEED, "1")
     os.environ["PYTHONPATH"] = os.pathsep.join([str(here), *filter(None, [os.environ.get("PYTHONPATH")])])
     install()
 
