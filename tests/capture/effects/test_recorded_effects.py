@@ -78,10 +78,11 @@ def test_the_robot_executes_what_it_would_without_them(pi_store, with_effects):
 )
 def test_a_rerun_of_one_condition_gives_the_same(with_effects, tmp_path, condition, words):
     target = tmp_path / "one.zarr"
-    assert main(["rerun", str(with_effects), "--output", str(target), "--check", "0", *words]) == 0
+    given = ["rerun", str(with_effects), "--output", str(target), "--check", "0", "--num-episodes", "1"]
+    assert main([*given, *words]) == 0
     recorded = changes(open_store(with_effects), condition)
     rerun = open_store(target)
-    assert set(recorded) == {episode.name for episode in rerun.episodes}
+    assert len(recorded) == 2 * len(rerun.episodes) == 4
     for episode in rerun.episodes:
         expected = episode.read("actions") - episode.read("base_actions")
         np.testing.assert_allclose(recorded[episode.name], expected, atol=1e-5)
@@ -106,7 +107,8 @@ def test_groups_are_cut_kept_and_controlled(with_groups, tmp_path):
     }
     for condition, words in options.items():
         target = tmp_path / f"{condition}.zarr"
-        assert main(["rerun", str(with_groups), "--output", str(target), "--check", "0", *words]) == 0
+        given = ["rerun", str(with_groups), "--output", str(target), "--check", "0", "--num-episodes", "1"]
+        assert main([*given, *words]) == 0
         for episode in open_store(target).episodes:
             expected = episode.read("actions") - episode.read("base_actions")
             np.testing.assert_allclose(changes(store, condition)[episode.name], expected, atol=1e-5)
@@ -127,15 +129,15 @@ def test_a_group_that_no_task_has_is_refused_before_the_first_episode(tmp_path, 
     assert not (tmp_path / "a.zarr").exists()
 
 
-def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):
+def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path):
     target = tmp_path / "later.zarr"
-    assert main(["rerun", str(pi_store), "--check", "0", "--output", str(target), *EFFECTS]) == 0
-    assert "0 episodes added" not in capsys.readouterr().out
+    words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1", "--output", str(target)]
+    assert main([*words, *EFFECTS]) == 0
     later, now = open_store(target), open_store(with_effects)
     assert verify_store(later) == []
     for name in ("without_word_cube_queries_all", "noise", "only_linguistic"):
         mine, theirs = changes(later, name), changes(now, name)
-        assert set(mine) == set(theirs)
+        assert len(mine) == 2
         for episode in mine:
             np.testing.assert_allclose(mine[episode], theirs[episode], atol=1e-6)
 
@@ -151,7 +153,7 @@ def test_a_rerun_of_changed_attention_is_refused(pi_store, tmp_path, capsys):
 
 
 def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_path, capsys):
-    path = capture(tmp_path / "pi.zarr", "pi", *EFFECTS)
+    path = shutil.copytree(with_effects, tmp_path / "pi.zarr")
     words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1"]
     words += ["--num-episodes", "2", "--max-steps", "12", "--output", str(path), "--resume"]
     assert main([*words, *EFFECTS]) == 0
