@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -117,19 +118,27 @@ def describe_machine(device: str) -> dict[str, str]:
     import torch
 
     facts = {"code": code_version(), "python": platform.python_version(), "processor": platform.machine()}
-    for name in _LIBRARIES:
-        try:
-            facts[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            facts[name] = "absent"
+    facts |= _library_versions()
     facts["device"] = torch.cuda.get_device_name(device) if device.startswith("cuda") else device
     # Sums over other numbers of threads may differ in their last bits.
     facts["threads"] = str(torch.get_num_threads())
     return facts
 
 
+@cache
+def _library_versions() -> dict[str, str]:
+    facts = {}
+    for name in _LIBRARIES:
+        try:
+            facts[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            facts[name] = "absent"
+    return facts
+
+
+@cache
 def code_version() -> str:
-    """Return the installed version, with the commit if the code runs from a git checkout."""
+    """Return the installed version, with the commit if the code runs from a git checkout; asked once a process."""
     version = metadata.version("vla-attention")
     folder = Path(__file__).resolve().parents[1]
     if not (folder / ".git").exists():
