@@ -7,6 +7,7 @@ languages check against. Decoding is strict (unknown and missing fields are erro
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from typing import Annotated, Any, TypeVar, get_args
@@ -75,4 +76,17 @@ def from_json(declared: type[T], data: Any, where: str = "$") -> T:
 def json_schema(declared: Any, title: str, description: str) -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of a declared document; nested documents become `$defs`."""
     about = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": title, "description": description}
-    return about | msgspec.json.schema(declared)
+    schema: dict[str, Any] = _without_indents(about | msgspec.json.schema(declared))
+    return schema
+
+
+def _without_indents(node: Any) -> Any:
+    """The descriptions are docstrings, which Python 3.13 has without the indents of the source, and 3.12 with them."""
+    if isinstance(node, list):
+        return [_without_indents(one) for one in node]
+    if not isinstance(node, dict):
+        return node
+    return {
+        name: inspect.cleandoc(one) if name == "description" and isinstance(one, str) else _without_indents(one)
+        for name, one in node.items()
+    }
