@@ -4,11 +4,11 @@
     python -m benchmarks.validation.libero_physics measure DIR    with the installed MuJoCo
     make .mujoco/3.8.1
     PYTHONPATH=.mujoco/3.8.1 python -m benchmarks.validation.libero_physics measure DIR
-    python -m benchmarks.validation.libero_physics tell DIR               into the page and the list of relations
+    python -m benchmarks.validation.libero_physics tell DIR       into the page and the list of relations
 
-`measure` goes on where it was ended; a task takes half a minute, and `SUITE:TASK,...` names some. `tell` writes the table of `docs/validation.md`, its
-rows beside this file, and `capture/environments/libero_beginnings.txt`: what the task files say of the beginning and is
-so under the MuJoCo of the published evaluations.
+`measure` goes on where it was ended; a task takes half a minute, and `SUITE:TASK,...` names some. `tell` writes the
+table of `docs/validation.md`, its rows beside this file, and `capture/environments/libero_beginnings.txt`: what the
+task files say of the beginning and is so under the MuJoCo of the published evaluations.
 """
 
 from __future__ import annotations
