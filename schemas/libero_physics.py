@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass, field
 
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import EpisodeAttributes, Protocol
 
 #: The version that is installed: Cosmos Policy's own, and the last one with the floors of 3.2.3, which openpi pins.
@@ -74,15 +75,13 @@ class SimulatedScenes:
         if self._by_version:
             number = sum(self._by_version.values())
             part = "" if number == self.num_episodes else f" in {number} of {every}"
-            newest = max(self._by_version, key=what_differs)
-            said.append(
-                f"was simulated with MuJoCo {listing(sorted(self._by_version))}{part} (capture again after {MEND}): "
-                f"{what_differs(newest)}"
-            )
+            versions = listing(sorted(self._by_version))
+            differs = max(map(what_differs, self._by_version), key=len)  # the longer one says what the other does
+            said.append(f"was simulated with MuJoCo {visible(versions)}{part} (capture again after {MEND}): {differs}")
         if self._lost:
-            relations = dict.fromkeys(relation for of_episode in self._lost for relation in of_episode)
+            relations = listing(dict.fromkeys(relation for of_episode in self._lost for relation in of_episode), 3)
             said.append(
-                f"in {len(self._lost)} of {every} the scene did not begin as the task says ({listing(relations, 3)})"
+                f"in {len(self._lost)} of {every} the scene did not begin as the task says ({visible(relations)})"
             )
         if not said:
             return ""

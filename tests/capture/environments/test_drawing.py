@@ -73,7 +73,7 @@ def test_it_is_said_before_the_model_is_loaded(environment, tmp_path: Path, capf
         code = evaluate("evaluate-attention-ratio", [*words, "--output-dir", str(tmp_path / "out")])
     said = capfd.readouterr()
     assert code == 2
-    assert ("99" in said.err, "RuntimeError" in said.err) == (True, True)
+    assert ("99" in said.err, "RuntimeError" in said.err) == (True, True), said.err
     assert (said.err.count("\n"), "Traceback" in said.out) == (1, False)
     assert list(tmp_path.rglob("*.zarr")) == []
 
