@@ -9,6 +9,7 @@
 #                    and .venv-lerobot06 of 5 GB, where there is a Python 3.12)
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
 #   make test-numpy1 recorder, stores and analysis with numpy 1.26, in an environment of its own (.venv-numpy1)
+#   make test-mujoco simulators with the oldest and the newest MuJoCo that the code runs with
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make test-rerun  Rerun recordings, with three releases of rerun-sdk, in an environment of its own (.venv-rerun)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
@@ -50,7 +51,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: libero-assets capture analyze test test-policies test-remote test-rerun test-policies-lerobot06 test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: libero-assets capture analyze test test-mujoco test-policies test-remote test-rerun test-policies-lerobot06 test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -93,6 +94,13 @@ package-newest: .venv/capture-installed
 # What openpi, OpenVLA and GR00T pin. zarr 3.1.5 is the last that takes it on Python 3.11.
 test-numpy1: .venv-numpy1/installed
 	.venv-numpy1/bin/pytest tests/schemas tests/analyze tests/capture/torch_policies tests/capture/recording tests/capture/store tests/kit $(ARGS)
+
+# The oldest and the newest MuJoCo with which the code runs, each in a folder that comes before the installed one.
+test-mujoco: .mujoco/3.2.7 .mujoco/3.9.0
+	for version in 3.2.7 3.9.0; do PYTHONPATH=.mujoco/$$version $(PYTEST) tests/capture/environments tests/capture/engine $(ARGS) || exit 1; done
+
+.mujoco/%: .venv/capture-installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target $@ mujoco==$*
 
 # Layouts of policies on small random models of the real classes. No environment fits scripts/constraints.txt, nor another:
 # transformers 5, LeRobot 0.4.4 and 0.6.1 want different versions of the same libraries.
@@ -243,4 +251,4 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-lerobot06 .venv-remote .venv-rerun .venv-audit .venv-notebooks .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-lerobot06 .venv-remote .venv-rerun .venv-audit .venv-notebooks .venv-docs .venv-numpy1 .mujoco build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -41,12 +41,15 @@ class EpisodeSteps(Document, frozen=True):
 
     `bodies`: whose poses are stored: `HAND`, then objects of the episode. `first_touch`: the moment at whose end the
     gripper first touched the body; None: at none, and for the hand. `goals`: of all tasks that share the scene, the
-    episode's own among them.
+    episode's own among them. `mujoco`: the version that simulated it. `lost_relations`: what LIBERO's task file says of
+    the beginning, is so under `libero_physics.PUBLISHED_MUJOCO`, and was not so at moment 0 (`bowl_1 on ramekin_1`).
     """
 
     bodies: tuple[str, ...]
     first_touch: tuple[int | None, ...]
     goals: tuple[TaskGoal, ...]
+    mujoco: str = ""
+    lost_relations: tuple[str, ...] = ()
 
     def goal_of(self, task_id: int) -> TaskGoal | None:
         """The goal of a task; None where it shares no scene with the episode."""

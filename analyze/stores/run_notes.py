@@ -1,4 +1,4 @@
-"""What every answer says of a run that was changed, or whose policy was told another sentence or a part of it."""
+"""What every answer says of a run with other scenes, of one that was changed, or told something else."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from msgspec.structs import replace
 
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.libero_physics import SimulatedScenes
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import EpisodeAttributes
 
 
@@ -21,10 +22,12 @@ class RunNotes:
         self._stores: dict[str, Store] = {}
         self._told: dict[str, list[str]] = {}
         self._lost: dict[str, list[str]] = {}
+        self._scenes: dict[str, SimulatedScenes] = {}
 
     def add(self, store: Store, attributes: EpisodeAttributes) -> None:
         """Look at an episode."""
         self._stores[str(store.path)] = store
+        self._scenes.setdefault(store.path.name, SimulatedScenes()).add(store.attributes.protocol, attributes)
         given, instruction = told_instruction(store, attributes), attributes.instruction
         if not same_words(given, instruction):
             said = f"'{visible(given)}' where the task is '{visible(instruction)}'"
@@ -48,20 +51,25 @@ class RunNotes:
         return (*others, *cut)
 
     @property
+    def of_scenes(self) -> tuple[str, ...]:
+        """A line on each store whose scenes are not those of LIBERO's published evaluations; see `libero_physics`."""
+        return tuple(filter(None, (scenes.describe(name) for name, scenes in self._scenes.items())))
+
+    @property
     def lines(self) -> tuple[str, ...]:
-        """A line on each store whose run was changed, and `of_prompts`; empty without any."""
+        """`of_scenes`, a line on each store whose run was changed, and `of_prompts`; empty without any."""
         # Of a run that differs in its prompt alone, the lines on prompts say more.
         told, every = self.of_prompts, self._stores.values()
         more = [store for store in every if not replace(store.attributes.interventions, prompt=None).is_none]
-        return (*change_notes(more if told else every), *told)
+        return (*self.of_scenes, *change_notes(more if told else every), *told)
 
 
-def prompt_notes(episodes: Iterable[tuple[Store, StoredEpisode]]) -> tuple[str, ...]:
-    """`RunNotes.of_prompts` of episodes."""
+def episode_notes(episodes: Iterable[tuple[Store, EpisodeAttributes]]) -> tuple[str, ...]:
+    """`RunNotes.of_scenes` and `RunNotes.of_prompts` of episodes."""
     notes = RunNotes()
-    for store, episode in episodes:
-        notes.add(store, episode.attributes)
-    return notes.of_prompts
+    for store, attributes in episodes:
+        notes.add(store, attributes)
+    return (*notes.of_scenes, *notes.of_prompts)
 
 
 def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:

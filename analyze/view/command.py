@@ -162,16 +162,15 @@ def _notes(stores: Sequence[Store]) -> tuple[str, ...]:
     from contextlib import suppress
     from pathlib import Path
 
-    from vla_attention.analyze.stores.run_notes import change_notes, prompt_notes
+    from vla_attention.analyze.stores.run_notes import change_notes, episode_notes
     from vla_attention.schemas.errors import UserError
 
     readable = []
     for store in stores:
         for episode in store.episodes if isinstance(store.path, Path) else ():
             with suppress(UserError):
-                if episode.attributes.prompts:
-                    readable.append((store, episode))
-    return (*change_notes(stores), *prompt_notes(readable))
+                readable.append((store, episode.attributes))
+    return (*change_notes(stores), *episode_notes(readable))
 
 
 def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:

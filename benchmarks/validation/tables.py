@@ -64,13 +64,17 @@ def success_table(results: Results) -> str:
 
 
 def fill_page(page: Path, results: Results) -> None:
+    """Write the three tables of the study into the page; see `fill_marks`."""
+    fill_marks(
+        page,
+        {"numbers": numbers_table(results), "ranks": ranks_table(results), "success": success_table(results)},
+    )
+
+
+def fill_marks(page: Path, blocks: Mapping[str, str]) -> None:
     """Replace what stands between the marks `<!-- NAME -->` and `<!-- end NAME -->`."""
     text = page.read_text(encoding="utf-8")
-    for name, block in (
-        ("numbers", numbers_table(results)),
-        ("ranks", ranks_table(results)),
-        ("success", success_table(results)),
-    ):
+    for name, block in blocks.items():
         begin, end = f"<!-- {name} -->", f"<!-- end {name} -->"
         if begin not in text or end not in text:
             raise BadArgument(f"{page} has no marks '{begin}' and '{end}' to write the table between.")

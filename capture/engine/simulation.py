@@ -105,12 +105,14 @@ class Advanced:
     """What some steps gave: their number, whether the task is solved, and what the next policy call gets, if any.
 
     moments: after each of the steps, or after the waiting steps; none where the environment tells none.
+    lost_relations: after the waiting steps, as in `TellsMoments`.
     """
 
     steps: int
     success: bool
     seen: Seen | None
     moments: tuple[Moment, ...] = ()
+    lost_relations: tuple[str, ...] = ()
 
 
 @dataclass
@@ -161,7 +163,9 @@ class Simulation:
             for i in range(self.protocol.wait_steps):
                 self.check()
                 observation = self.environment.step(action, observe=i == self.protocol.wait_steps - 1).observation
-            return Advanced(0, False, None if observation is None else self._seen(observation), self._moment())
+            seen = None if observation is None else self._seen(observation)
+            lost = self.environment.lost_relations() if isinstance(self.environment, TellsMoments) else ()
+            return Advanced(0, False, seen, self._moment(), lost)
 
     def advance(self, actions: NDArray[np.float64], observe: bool) -> Advanced:
         """Execute actions (step, 7) until the task is solved; with `observe` the last one is observed.

@@ -47,8 +47,9 @@ from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.store.replan_records import RecordedSteps
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.episode_steps import EpisodeSteps
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.layout import camera_grids
+from vla_attention.schemas.libero_physics import MEND, PUBLISHED_MUJOCO
 from vla_attention.schemas.stores.store_format import Protocol
 
 #: A simulator that gives no answer is ended after so many times the slowest answer of this run so far, but not before
@@ -147,6 +148,7 @@ class Simulators(Source):
     #: What simulators of each task know of its resets, for the others.
     _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
     _told_of_resets: set[int] = field(default_factory=set, init=False)
+    _told_of_relations: set[int] = field(default_factory=set, init=False)
     #: Seconds of the slowest answer so far, at beginnings (True) and after actions (False).
     slowest: dict[bool, float] = field(default_factory=lambda: {True: 0.0, False: 0.0}, init=False)
 
@@ -220,6 +222,16 @@ class Simulators(Source):
                 f"{first.number} first."
             )
 
+    def tell_lost_relations(self, episode: SimulatedEpisode, lost: Sequence[str]) -> None:
+        """Say, once a task, that a scene did not begin as its task says."""
+        task_id = episode.job.begins_as[0]
+        if lost and task_id not in self._told_of_relations:
+            self._told_of_relations.add(task_id)
+            self.say(
+                f"WARNING: {episode.title} does not begin as its task says: not so is {listing(lost)}. It is so with "
+                f"MuJoCo {PUBLISHED_MUJOCO}: {MEND}."
+            )
+
     def learn_resets(self, task_id: int, resets: Sequence[object]) -> None:
         """Keep what a simulator knows of a task's resets, for the others."""
         self._resets[task_id] = max(self._resets.get(task_id, ()), resets, key=len)
@@ -255,6 +267,7 @@ class SimulatedEpisode(Episode):
     _replan: int = field(default=0, init=False)
     _success: bool = field(default=False, init=False)
     _moments: list[Moment] = field(default_factory=list, init=False)
+    _lost_relations: tuple[str, ...] = field(default=(), init=False)
     _executed: list[NDArray[np.float64]] = field(default_factory=list, init=False)
     _closed: bool = field(default=False, init=False)
 
@@ -327,6 +340,8 @@ class SimulatedEpisode(Episode):
         self.done += result.steps
         self._success = result.success
         self._moments += result.moments
+        self._lost_relations += result.lost_relations
+        self.source.tell_lost_relations(self, result.lost_relations)
         if self._success or self.done >= self.source.protocol.max_steps:
             return Outcome(self._success, self.done, self._steps())
         if result.seen is None:
@@ -367,7 +382,13 @@ class SimulatedEpisode(Episode):
             structs.replace(goal, first_held=_first(when)) for goal, when in zip(self.begun.goals, held.T, strict=True)
         ]
         return RecordedSteps(
-            EpisodeSteps(self.begun.bodies, tuple(map(_first, touched.T)), tuple(goals)),
+            EpisodeSteps(
+                self.begun.bodies,
+                tuple(map(_first, touched.T)),
+                tuple(goals),
+                self.source.machine.get("mujoco", ""),
+                self._lost_relations,
+            ),
             poses=np.stack([moment.poses for moment in self._moments]),
             gripper=np.stack([moment.gripper for moment in self._moments]),
             # Those after the one that solved the task were not executed.

@@ -200,6 +200,9 @@ class TellsMoments(Protocol):
     def moment(self) -> Moment:
         """Return what holds after the last step, or after the reset."""
 
+    def lost_relations(self) -> tuple[str, ...]:
+        """Return what should be so after the waiting steps and is not; see `EpisodeSteps.lost_relations`."""
+
 
 def initial_state_seed(scenes: str, index: int) -> int:
     """Return the seed of one initial state, the same on every machine; scenes: a task, or what the scenes are for."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_assets import find_assets
+from vla_attention.capture.environments.libero_beginnings import relations_of
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
 from vla_attention.capture.environments.libero_pro import (
     check_pro_assets,
@@ -182,6 +183,7 @@ class LiberoEnvironment(SimulatedEnvironment):
         return ResetStart(np.random.get_state(), len(samplers))  # noqa: NPY002
 
     def _set_initial_state(self, initial_state_index: int) -> None:
+        self._initial_state_index = initial_state_index
         simulation = self._simulator.sim
         state = self._initial_states[initial_state_index]
         expected = 1 + simulation.model.nq + simulation.model.nv
@@ -205,6 +207,11 @@ class LiberoEnvironment(SimulatedEnvironment):
             of_interest = read_task_file(task_file(task))["obj_of_interest"]
             goals.append(goal_of(task, map(" ".join, conditions), _subjects(of_interest, names)))
         return goals
+
+    def lost_relations(self) -> tuple[str, ...]:
+        """Return what the task's file says of the beginning and does not hold now; see `EpisodeSteps`."""
+        said = relations_of(self.task.suite, self.task.task_id, self._initial_state_index)
+        return tuple(one.text for one in said if not self._simulator._eval_predicate(list(one.words)))
 
     def _held(self) -> Sequence[bool]:
         simulator = self._simulator

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import copy
 import functools
 import hashlib
 import random
@@ -113,7 +114,6 @@ class SimulatedEnvironment:
         self._gate = CameraGate(self._image_size, before_drawing=self._keep_moment)
         self._digest: str | None = None
         self._moment: Any = None  # copy of the simulation data at the moment of the last pictures
-        self._moment_is_kept = False
         self._closed = False
         with readable_device_choice(), seeded(0):
             self._simulator = self._build(self._simulator_options())
@@ -192,15 +192,12 @@ class SimulatedEnvironment:
         with seeded(self._reset_seed(initial_state_index, seed)):
             self._reset_simulator(initial_state_index, seed)
             self._set_initial_state(initial_state_index)
-        import mujoco
-
         from vla_attention.capture.environments.segmentation import owners_of_bodies
 
         model = self._simulator.sim.model
         state = np.asarray(self._simulator.sim.get_state().flatten(), dtype=np.float64)
         self._digest = hashlib.sha256(state.tobytes()).hexdigest()
-        self._moment = mujoco.MjData(model._model)
-        self._moment_is_kept = False
+        self._moment = None
         index_of = {scene_object.name: index for index, scene_object in enumerate(self.objects)}
         roots = {model.body_name2id(body): index_of[name] for name, bodies in self._roots.items() for body in bodies}
         self._background = index_of[BACKGROUND]
@@ -251,7 +248,7 @@ class SimulatedEnvironment:
             raise BadArgument(f"An action is {ACTION_SIZE} finite numbers; got shape {action.shape}: {action}.")
         self._gate.open, self._gate.num_drawn = observe, 0
         if observe:
-            self._moment_is_kept = False
+            self._moment = None
         try:
             values = self._simulator.step(action)[0]
         finally:
@@ -286,6 +283,10 @@ class SimulatedEnvironment:
             held=np.array(self._held(), dtype=bool),
         )
 
+    def lost_relations(self) -> tuple[str, ...]:
+        """Return none: nothing is said of how the scene begins; see `TellsMoments`."""
+        return ()
+
     def _site_orientation(self, site: int) -> NDArray[np.float64]:
         """A site's quaternion (w, x, y, z). `eef_quat`, which policies get, is that of the body above the gripper."""
         import mujoco
@@ -306,12 +307,8 @@ class SimulatedEnvironment:
     def _keep_moment(self) -> None:
         """Before the first picture of a step, copy the state that it shows; the step ends with another state."""
         self._make_context_current()
-        if not self._moment_is_kept:
-            import mujoco
-
-            simulation = self._simulator.sim
-            mujoco.mj_copyData(self._moment, simulation.model._model, simulation.data._data)
-            self._moment_is_kept = True
+        if self._moment is None:
+            self._moment = copy.copy(self._simulator.sim.data._data)
 
     def _make_context_current(self) -> None:
         context = getattr(self._simulator.sim, "_render_context_offscreen", None)
@@ -325,7 +322,7 @@ class SimulatedEnvironment:
         if camera not in CAMERAS:
             raise unknown_name("camera", camera, CAMERAS)
         self._require_episode()
-        if not self._moment_is_kept:
+        if self._moment is None:
             raise RuntimeError("No picture of this episode exists yet; step with observe=True first.")
         self._make_context_current()
         simulation = self._simulator.sim

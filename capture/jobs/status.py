@@ -13,6 +13,7 @@ from vla_attention.capture.jobs.worker_log import Event, planned_episodes, read_
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.libero_physics import SimulatedScenes
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.locks import Holder, episode_locks
 from vla_attention.schemas.stores.reader import open_store
@@ -64,13 +65,15 @@ class TaskStatus:
 
 @dataclass(frozen=True)
 class StoreStatus:
-    """A store. `writing`: who is writing which of its episodes."""
+    """A store. `writing`: who is writing which of its episodes. `scenes`: how they differ from the published ones, of
+    `libero_physics`; empty where they do not."""
 
     store: str
     suite: str
     policy: str
     tasks: tuple[TaskStatus, ...]
     writing: tuple[Holder, ...]
+    scenes: str
 
     @property
     def complete(self) -> bool | None:
@@ -128,12 +131,14 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
             task.missing = sorted(wanted - {index for task_id, index in present.values() if task_id == task.task_id})
     for name, event in drops.items():
         tasks[parse_episode_name(name)[0]].dropped.append(event)
+    scenes = SimulatedScenes()
     for stored in store.episodes:
         task, folder = tasks[present[stored.name][0]], local_path(stored.folder)
         fault = look_at(store, stored, verify)
         if fault is not None:
             task.damaged.append(fault)
             continue
+        scenes.add(root.protocol, stored.attributes)
         task.instruction = stored.attributes.instruction
         task.committed += 1
         task.success += stored.attributes.success is True
@@ -144,7 +149,8 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
         if at > task.last_at:
             task.last_at, task.last_by = at, commit.by if commit else ""
     writing = tuple(episode_locks(path).holders())
-    return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing)
+    told = scenes.describe(path.name)
+    return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing, told)
 
 
 def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool, verify: bool = False) -> int:
@@ -172,7 +178,8 @@ def _text(status: StoreStatus) -> str:
     begun = sum(task.committed > 0 for task in tasks)
     lines = [
         f"{status.store}: {status.suite}, policy {status.policy}, {plural(committed, 'episode')} of "
-        f"{plural(begun, 'task')}, {format_bytes(size)}"
+        f"{plural(begun, 'task')}, {format_bytes(size)}",
+        *filter(None, [status.scenes]),
     ]
     rows: list[tuple[str, ...]] = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction")]
     rows += [task.cells() for task in tasks]

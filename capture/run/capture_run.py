@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from vla_attention.capture.effects.conditions import refuse_both
@@ -32,6 +32,7 @@ from vla_attention.capture.run.run_settings import RunSettings, default_num_envs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.libero_physics import MEND, is_libero, what_differs
 from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores.store_format import PolicyIdentity, Protocol
 from vla_attention.schemas.stores.verify import DamagedEpisodesLeft, find_damaged, what_to_do
@@ -92,7 +93,7 @@ def run_capture(
     damaged = find_damaged(store.path, {job.name for job in jobs}, settings.output.verify) if done else []
     pictures = stored_picture_sizes(policy, protocol.image_size)
     bound = estimate_disk(caller.recording, policy.sites, pictures, max_replans(protocol), len(todo))
-    lines = [*_lines_on_source(policy.identity(), protocol), *source_lines]
+    lines = [*_lines_on_source(policy.identity(), protocol), *lines_on_physics(machine, protocol), *source_lines]
     announce(attributes, lines, bound, store.path, len(jobs), damaged)
     others = [(tasks[i], episode) for i in settings.array_task_ids for episode in range(settings.num_episodes)]
     plan = plan_of([*((job.task, job.episode_index) for job in jobs), *others])
@@ -177,6 +178,14 @@ def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: 
     if single and asked is not None and asked > 1:
         raise BadArgument(f"Cannot use --policy-batch {asked}{single}; leave it out.")
     return asked or (1 if single or device.startswith("cpu") else num_envs)
+
+
+def lines_on_physics(machine: Mapping[str, str], protocol: Protocol) -> list[str]:
+    """Return a line where LIBERO's scenes will not be those of the published evaluations."""
+    version = machine.get("mujoco", "")
+    if not is_libero(protocol.suite) or not (differs := what_differs(version)):
+        return []
+    return [f"WARNING: with MuJoCo {version} {differs}; {MEND} mends it."]
 
 
 def _lines_on_source(identity: PolicyIdentity, protocol: Protocol) -> list[str]:

@@ -25,6 +25,7 @@ from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.schemas.command_line import describe_os_error, format_bytes
 from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, listing, plural
+from vla_attention.schemas.libero_physics import MEND, what_differs
 from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_place import bytes_below, check_writable, room_at
@@ -54,7 +55,7 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
             missing.append(what)
 
     look("memory", lambda: find_memory(threads, suite))
-    look("robosuite", _find_robosuite)
+    look("robosuite", lambda: find_robosuite_for(suite))
     if suite.kind == "libero":
         look("LIBERO", lambda: _find_libero(suite))
         look("assets", lambda: find_libero_assets(check_pro_assets(suite.name, find_assets(assets))))
@@ -89,9 +90,13 @@ def find_memory(threads: Threads, suite: Suite) -> Finding:
     return "ok", f"{format_bytes(least.bytes)} available, by what {least.by} leaves. {of_policy}"
 
 
-def _find_robosuite() -> Finding:
+def find_robosuite_for(suite: Suite) -> Finding:
+    """Return the versions of robosuite and MuJoCo, and what this MuJoCo does to LIBERO's scenes."""
     find_robosuite()
-    return "ok", f"robosuite {_version('robosuite')}, MuJoCo {_version('mujoco')}."
+    found, mujoco = f"robosuite {_version('robosuite')}, MuJoCo", _version("mujoco")
+    if suite.kind == "libero" and (differs := what_differs(mujoco)):
+        return "note", f"{found} {mujoco}: {differs}. {MEND} mends it."
+    return "ok", f"{found} {mujoco}."
 
 
 def _find_libero(suite: Suite) -> Finding:
@@ -102,7 +107,7 @@ def _find_libero(suite: Suite) -> Finding:
         pass
     else:
         mend = f"`pip uninstall {_OVERWRITES}`, then `pip install --force-reinstall --no-deps hf-libero==0.1.4`"
-        return "MISSING", f"{overwriting} has overwritten files of hf-libero, and fails on this MuJoCo: {mend}."
+        return "MISSING", f"{overwriting} has overwritten files of hf-libero: {mend}."
     return "ok", f"hf-libero {_version('hf-libero')}, {tasks} in {package_folder()}."
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -25,11 +26,17 @@ DUMMY = (
 )
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _whether_anything_is_drawn_is_not_asked() -> Iterator[None]:
-    """tests/capture/environments/test_drawing.py does; each time a new process imports everything and draws."""
+@contextmanager
+def drawing_is_not_asked() -> Iterator[None]:
+    """tests/capture/environments/test_drawing.py asks; each time a new process imports everything and draws."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)  # not of the session, whose other tests would find it changed
+def _drawing_is_not_asked() -> Iterator[None]:
+    with drawing_is_not_asked():
         yield
 
 
@@ -38,7 +45,8 @@ def run_capture() -> Callable[..., None]:
     """Run `vla-capture pi` with the tiny policy and further arguments; anything but success fails the test."""
 
     def run(*arguments: object) -> None:
-        assert capture([*DUMMY, *map(str, arguments)]) == 0
+        with drawing_is_not_asked():
+            assert capture([*DUMMY, *map(str, arguments)]) == 0
 
     return run
 

@@ -61,6 +61,9 @@ class ToldScene(StillScene):
         touches = self.steps >= WAIT_STEPS + 3
         return Moment(poses, np.full(2, 0.04, np.float32), np.array([False, touches]), np.array([False, touches]))
 
+    def lost_relations(self) -> tuple[str, ...]:
+        return ()
+
 
 def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let captures of this test run in a `ToldScene`."""

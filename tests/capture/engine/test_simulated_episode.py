@@ -132,7 +132,8 @@ def run_episode(
     """Run an episode in this process; also returns the `start` and (step, replans) after each call."""
     monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: environment)
     caller = Caller(policy or FakePolicy(), store.attributes.recording)
-    source = Simulators(None, None, store, caller, {"host": "x"}, check)  # type: ignore[arg-type]
+    machine = {"host": "x", "mujoco": "3.8.1"}
+    source = Simulators(None, None, store, caller, machine, check)  # type: ignore[arg-type]
     episode = source.open(EpisodeJob(TASK, index, 8, ""))
     done: list[int] = []
     while not isinstance(given := episode.poll(), Outcome):
@@ -160,7 +161,7 @@ def test_waiting_steps_then_a_policy_call_for_every_chunk(monkeypatch) -> None:
     assert told.done == [3, 6, 8]
     assert outcome == Outcome(False, 8)
     assert (told.start.initial_state_index, told.start.initial_state_digest) == (2, "d" * 64)
-    assert told.start.provenance == {"host": "x"}
+    assert told.start.provenance == {"host": "x", "mujoco": "3.8.1"}
 
 
 def test_a_solved_task_ends_the_episode(monkeypatch) -> None:
@@ -184,8 +185,11 @@ class WatchedEnvironment(FakeEnvironment):
             poses, np.zeros(2, np.float32), np.array([False, touched]), np.array([number == self.solved_after, touched])
         )
 
+    def lost_relations(self) -> tuple[str, ...]:
+        return ("cube on plate",) if len(self.actions) == WAIT_STEPS else ()
 
-def test_what_is_told_of_every_step_is_stored(monkeypatch) -> None:
+
+def test_what_is_told_of_every_step_is_stored(monkeypatch, capsys) -> None:
     environment = WatchedEnvironment(solved_after=WAIT_STEPS + 4)
     steps = run_episode(monkeypatch, environment, FakeStore())[0].steps
     assert steps is not None
@@ -195,6 +199,8 @@ def test_what_is_told_of_every_step_is_stored(monkeypatch) -> None:
     assert (steps.poses.dtype, steps.actions.dtype, steps.gripper.shape) == (np.float32, np.float32, (5, 2))
     assert steps.attributes.bodies == ("hand", "cube")
     assert steps.attributes.first_touch == (None, 2)
+    assert (steps.attributes.mujoco, steps.attributes.lost_relations) == ("3.8.1", ("cube on plate",))
+    assert capsys.readouterr().out.count("cube on plate") == 1
     assert [goal.first_held for goal in steps.attributes.goals] == [4, 2]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,11 @@ pytest.importorskip("robosuite")
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
 from vla_attention.capture.environments.episode_protocol import CAMERAS, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
+from vla_attention.capture.environments.libero_beginnings import read_numbers, relations_of, write_numbers
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
 from vla_attention.capture.environments.suites import find_suite, make_environment
 from vla_attention.schemas.errors import UnknownName
+from vla_attention.schemas.libero_physics import what_differs
 
 SUITE, TASK_ID, SEED, INDEX = "libero_spatial", 7, 7, 3
 ACTIONS = np.random.default_rng(0).uniform(-1, 1, (7, 7))
@@ -172,3 +175,30 @@ def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[
     assert episode[0].images["agentview"][plate].mean() > 150  # the plate is the lightest thing on the table
     with pytest.raises(UnknownName, match="'agentview'"):
         environment.segmentation("agent_view")
+
+
+@pytest.mark.libero
+@pytest.mark.simulator
+def test_the_bowl_stands_on_the_ramekin_where_the_physics_is_that_of_the_published_evaluations(libero_assets) -> None:
+    environment = make_environment(find_suite("libero_spatial"), 5, EnvironmentSettings(libero_assets=libero_assets))
+    assert isinstance(environment, LiberoEnvironment)
+    try:
+        run_episode(environment, 0, 0, ())
+        lost = environment.lost_relations()
+        place = dict(zip(environment.bodies, environment.moment().poses[:, :3], strict=True))
+    finally:
+        environment.close()
+    across = place["akita_black_bowl_1"][:2] - place["glazed_rim_porcelain_ramekin_1"][:2]
+    fallen = "rest elsewhere" in what_differs(version("mujoco"))
+    assert lost == (("akita_black_bowl_1 on glazed_rim_porcelain_ramekin_1",) if fallen else ())
+    assert (np.linalg.norm(across) > 0.03) == fallen
+
+
+def test_numbers_of_states_are_read_as_they_are_written() -> None:
+    for numbers in ([], [0], [0, 1, 2], [3, 5, 6, 7, 49], list(range(50))):
+        assert read_numbers(write_numbers(numbers)) == set(numbers)
+    known = [relations_of("libero_spatial", 5, state) for state in range(50)]
+    assert all(
+        ("on", "akita_black_bowl_1", "glazed_rim_porcelain_ramekin_1") in {one.words for one in of} for of in known
+    )
+    assert relations_of("libero_spatial", 5, 50) == relations_of("made_up", 5, 0) == ()

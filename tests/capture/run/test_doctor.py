@@ -16,8 +16,9 @@ from vla_attention.capture.commands.arguments import build_parser
 from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, VAE_NAME, VAE_REPOSITORY
-from vla_attention.capture.run.doctor import Finding, find_checkpoint, find_drawing, find_gpu
+from vla_attention.capture.run.doctor import Finding, find_checkpoint, find_drawing, find_gpu, find_robosuite_for
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.libero_physics import MEND, PUBLISHED_MUJOCO
 
 
 def checkpoint_of(*words: str) -> Finding:
@@ -42,6 +43,17 @@ def test_a_jax_checkpoint_without_its_arrays_is_missing(tmp_path: Path, monkeypa
     for name in (str(folder), address):
         with pytest.raises(UserError, match="params"):
             checkpoint_of("pi", "--checkpoint", name, *words)
+
+
+@pytest.mark.parametrize(
+    ("suite", "installed", "status"),
+    [("libero_goal", "3.8.1", "note"), ("libero_goal", PUBLISHED_MUJOCO, "ok"), ("cubes", "3.8.1", "ok")],
+)
+def test_another_physics_than_liberos_is_told_with_what_mends_it(monkeypatch, suite, installed, status):
+    pytest.importorskip("robosuite")
+    monkeypatch.setattr("vla_attention.capture.run.doctor.version", lambda package: installed)
+    found = find_robosuite_for(find_suite(suite))
+    assert (found[0], MEND in found[1]) == (status, status == "note")
 
 
 @pytest.mark.parametrize(
