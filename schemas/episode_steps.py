@@ -6,7 +6,7 @@ a simulator of ours ran the episode; `docs/store.md` has the arrays.
 
 from __future__ import annotations
 
-from vla_attention.schemas.jsonable import Document
+from vla_attention.schemas.jsonable import Document, Number
 
 #: Position (3,) in metres and orientation as a quaternion (w, x, y, z), in the world frame, of every body.
 POSES = "steps/poses"
@@ -36,6 +36,13 @@ class TaskGoal(Document, frozen=True):
     things: tuple[str, ...] = ()
 
 
+class Displaced(Document, frozen=True):
+    """An object of LIBERO that stood elsewhere at moment 0 than under `libero_physics.PUBLISHED_MUJOCO`; metres."""
+
+    name: str
+    distance: Number
+
+
 class EpisodeSteps(Document, frozen=True):
     """What the arrays `steps/...` of an episode are of, and what they were looked at for.
 
@@ -43,6 +50,7 @@ class EpisodeSteps(Document, frozen=True):
     gripper first touched the body; None: at none, and for the hand. `goals`: of all tasks that share the scene, the
     episode's own among them. `mujoco`: the version that simulated it. `lost_relations`: what LIBERO's task file says of
     the beginning, is so under `libero_physics.PUBLISHED_MUJOCO`, and was not so at moment 0 (`bowl_1 on ramekin_1`).
+    `displaced`: the objects that stood elsewhere.
     """
 
     bodies: tuple[str, ...]
@@ -50,6 +58,7 @@ class EpisodeSteps(Document, frozen=True):
     goals: tuple[TaskGoal, ...]
     mujoco: str = ""
     lost_relations: tuple[str, ...] = ()
+    displaced: tuple[Displaced, ...] = ()
 
     def goal_of(self, task_id: int) -> TaskGoal | None:
         """The goal of a task; None where it shares no scene with the episode."""

@@ -8,8 +8,11 @@ settle elsewhere: the bowl of `libero_spatial` task 5 slides off the ramekin. Si
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain
 
+from vla_attention.schemas.episode_steps import Displaced
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import EpisodeAttributes, Protocol
@@ -52,6 +55,19 @@ def simulated_with(protocol: Protocol, episode: EpisodeAttributes) -> str:
     return episode.provenance.get("mujoco", "") if protocol.name == "recorded" else ""
 
 
+def describe_departures(lost_relations: Iterable[str], displaced: Iterable[Displaced]) -> list[str]:
+    """What is not as in the published evaluations at the beginning, as parts of a sentence; none where all is."""
+    said, farthest = [], dict[str, float]()
+    if relations := list(dict.fromkeys(lost_relations)):
+        said.append(f"the scene did not begin as the task says ({visible(listing(relations, 3))})")
+    for one in displaced:
+        farthest[one.name] = max(one.distance, farthest.get(one.name, 0.0))
+    if farthest:
+        moved = [f"{name} by {100 * far:.0f} cm" for name, far in sorted(farthest.items(), key=lambda of: -of[1])]
+        said.append(f"objects stood elsewhere than in the published evaluations ({visible(listing(moved, 3))})")
+    return said
+
+
 @dataclass
 class SimulatedScenes:
     """Counts, of episodes one after the other, those whose scenes are not those of the published evaluations."""
@@ -59,6 +75,7 @@ class SimulatedScenes:
     num_episodes: int = 0
     _by_version: dict[str, int] = field(default_factory=dict)
     _lost: list[tuple[str, ...]] = field(default_factory=list)
+    _displaced: list[tuple[Displaced, ...]] = field(default_factory=list)
 
     def add(self, protocol: Protocol, episode: EpisodeAttributes) -> None:
         """Count an episode of a run."""
@@ -68,6 +85,8 @@ class SimulatedScenes:
             self._by_version[version] = self._by_version.get(version, 0) + 1
         if episode.steps is not None and episode.steps.lost_relations:
             self._lost.append(episode.steps.lost_relations)
+        if episode.steps is not None and episode.steps.displaced:
+            self._displaced.append(episode.steps.displaced)
 
     def describe(self, name: str) -> str:
         """How the scenes of a store differ, with the command that mends it, as a sentence; empty where they do not."""
@@ -78,11 +97,11 @@ class SimulatedScenes:
             versions = listing(sorted(self._by_version))
             differs = max(map(what_differs, self._by_version), key=len)  # the longer one says what the other does
             said.append(f"was simulated with MuJoCo {visible(versions)}{part} (capture again after {MEND}): {differs}")
-        if self._lost:
-            relations = listing(dict.fromkeys(relation for of_episode in self._lost for relation in of_episode), 3)
-            said.append(
-                f"in {len(self._lost)} of {every} the scene did not begin as the task says ({visible(relations)})"
-            )
+        for of_episodes, parts in (
+            (self._lost, describe_departures(chain.from_iterable(self._lost), ())),
+            (self._displaced, describe_departures((), chain.from_iterable(self._displaced))),
+        ):
+            said += [f"in {len(of_episodes)} of {every} {part}" for part in parts]
         if not said:
             return ""
-        return f"{name} {'; '.join(said)}." if self._by_version else f"Of {name}: {said[0]}."
+        return f"{name} {'; '.join(said)}." if self._by_version else f"Of {name}: {'; '.join(said)}."

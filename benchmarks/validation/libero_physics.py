@@ -4,11 +4,11 @@
     python -m benchmarks.validation.libero_physics measure DIR    with the installed MuJoCo
     make .mujoco/3.8.1
     PYTHONPATH=.mujoco/3.8.1 python -m benchmarks.validation.libero_physics measure DIR
-    python -m benchmarks.validation.libero_physics tell DIR       into the page and the list of relations
+    python -m benchmarks.validation.libero_physics tell DIR       into the page and the package
 
 `measure` goes on where it was ended; a task takes half a minute, and `SUITE:TASK,...` names some. `tell` writes the
-table of `docs/validation.md`, its rows beside this file, and `capture/environments/libero_beginnings.txt`: what the
-task files say of the beginning and is so under the MuJoCo of the published evaluations.
+table of `docs/validation.md`, its rows beside this file, and `capture/environments/libero_beginnings.npz`, with which
+captures compare.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.validation.tables import fill_marks, markdown
 from vla_attention.capture.environments.base import EnvironmentSettings, Suite, Task
 from vla_attention.capture.environments.episode_protocol import OPENPI, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.libero import LiberoEnvironment, parent_of_region, read_task_file, task_file
-from vla_attention.capture.environments.libero_beginnings import FILE, HEAD, Relation, write_numbers
+from vla_attention.capture.environments.libero_beginnings import ELSEWHERE_M, FILE, PARTS
 from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.libero_physics import PUBLISHED_MUJOCO
@@ -34,8 +35,6 @@ from vla_attention.schemas.libero_physics import PUBLISHED_MUJOCO
 PAGE, ROWS = Path("docs/validation.md"), Path(__file__).with_suffix(".json")
 #: The newest MuJoCo that hf-libero allows; objects come to rest as under it from 3.4 on.
 OTHER_MUJOCO = "3.8.1"
-#: An object that stands farther than this from its place under the other MuJoCo stands elsewhere.
-ELSEWHERE_M = 0.01
 
 
 class Undrawn(LiberoEnvironment):
@@ -102,7 +101,7 @@ def row_of(task: Task, one: Any, other: Any) -> dict[str, Any]:
     moved = np.linalg.norm(one["places"] - other["places"], axis=2)  # (state, object)
     farthest = np.median(moved, axis=0)
     relations = {
-        Relation(tuple(words.split())).text: [
+        "{1} {0} {2}".format(*words.split()): [
             int(one["holds"][:, i].sum()),
             int((one["holds"] & other["holds"])[:, i].sum()),
         ]
@@ -147,7 +146,7 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
             )
     return "\n\n".join(
         [
-            markdown(("suite", "tasks with an object more than 1 cm elsewhere", "states"), by_suite),
+            markdown(("suite", "tasks with an object more than 2 cm elsewhere", "states"), by_suite),
             markdown(
                 (
                     "task",
@@ -162,24 +161,20 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def tell(work: Path) -> None:
-    """Write rows, page and list of relations."""
-    rows, lines = [], []
+    """Write rows, page, and what the published evaluations begin with."""
+    rows, kept = [], dict[str, NDArray[Any]]()
     for suite in SUITES:
         for task in list_tasks(suite) if suite.kind == "libero" else ():
-            one, other = (
-                work / version / f"{suite.name}_{task.task_id}.npz" for version in (PUBLISHED_MUJOCO, OTHER_MUJOCO)
-            )
+            name = f"{suite.name}_{task.task_id}"
+            one, other = (work / version / f"{name}.npz" for version in (PUBLISHED_MUJOCO, OTHER_MUJOCO))
             if not one.exists():
                 continue
-            with np.load(one) as mine:
-                for number, words in enumerate(mine["relations"].tolist()):
-                    states = np.flatnonzero(mine["holds"][:, number]).tolist()
-                    if states:
-                        lines.append(f"{suite.name} {task.task_id} {words}: {write_numbers(states)}")
-                if other.exists():
-                    with np.load(other) as its:
-                        rows.append(row_of(task, mine, its))
-    FILE.write_text("\n".join([HEAD, *lines]) + "\n", encoding="utf-8")
+            mine = dict(np.load(one))
+            kept |= {f"{name}/{part}": mine[part] for part in PARTS}
+            kept[f"{name}/places"] = np.round(1000 * mine["places"]).astype(np.int16)
+            if other.exists():
+                rows.append(row_of(task, mine, dict(np.load(other))))
+    np.savez_compressed(FILE, **kept)  # type: ignore[arg-type]  # numpy's own has a keyword that is no array
     ROWS.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     fill_marks(PAGE, {"libero physics": tables(rows)})
 

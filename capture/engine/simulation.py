@@ -16,6 +16,8 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import (
+    NO_DEPARTURES,
+    Departures,
     Environment,
     Moment,
     Observation,
@@ -105,14 +107,14 @@ class Advanced:
     """What some steps gave: their number, whether the task is solved, and what the next policy call gets, if any.
 
     moments: after each of the steps, or after the waiting steps; none where the environment tells none.
-    lost_relations: after the waiting steps, as in `TellsMoments`.
+    departures: after the waiting steps, as in `TellsMoments`.
     """
 
     steps: int
     success: bool
     seen: Seen | None
     moments: tuple[Moment, ...] = ()
-    lost_relations: tuple[str, ...] = ()
+    departures: Departures = NO_DEPARTURES
 
 
 @dataclass
@@ -164,8 +166,8 @@ class Simulation:
                 self.check()
                 observation = self.environment.step(action, observe=i == self.protocol.wait_steps - 1).observation
             seen = None if observation is None else self._seen(observation)
-            lost = self.environment.lost_relations() if isinstance(self.environment, TellsMoments) else ()
-            return Advanced(0, False, seen, self._moment(), lost)
+            departures = self.environment.departures() if isinstance(self.environment, TellsMoments) else NO_DEPARTURES
+            return Advanced(0, False, seen, self._moment(), departures)
 
     def advance(self, actions: NDArray[np.float64], observe: bool) -> Advanced:
         """Execute actions (step, 7) until the task is solved; with `observe` the last one is observed.

@@ -41,15 +41,15 @@ from vla_attention.capture.engine.simulator_process import (
     SimulatorSetup,
 )
 from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, SourceLost, episode_start
-from vla_attention.capture.environments.base import EnvironmentSettings, Moment, Suite
+from vla_attention.capture.environments.base import NO_DEPARTURES, Departures, EnvironmentSettings, Moment, Suite
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.store.replan_records import RecordedSteps
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.episode_steps import EpisodeSteps
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.layout import camera_grids
-from vla_attention.schemas.libero_physics import MEND, PUBLISHED_MUJOCO
+from vla_attention.schemas.libero_physics import MEND, describe_departures, what_differs
 from vla_attention.schemas.stores.store_format import Protocol
 
 #: A simulator that gives no answer is ended after so many times the slowest answer of this run so far, but not before
@@ -148,7 +148,7 @@ class Simulators(Source):
     #: What simulators of each task know of its resets, for the others.
     _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
     _told_of_resets: set[int] = field(default_factory=set, init=False)
-    _told_of_relations: set[int] = field(default_factory=set, init=False)
+    _told_of_departures: set[int] = field(default_factory=set, init=False)
     #: Seconds of the slowest answer so far, at beginnings (True) and after actions (False).
     slowest: dict[bool, float] = field(default_factory=lambda: {True: 0.0, False: 0.0}, init=False)
 
@@ -222,15 +222,13 @@ class Simulators(Source):
                 f"{first.number} first."
             )
 
-    def tell_lost_relations(self, episode: SimulatedEpisode, lost: Sequence[str]) -> None:
-        """Say, once a task, that a scene did not begin as its task says."""
-        task_id = episode.job.begins_as[0]
-        if lost and task_id not in self._told_of_relations:
-            self._told_of_relations.add(task_id)
-            self.say(
-                f"WARNING: {episode.title} does not begin as its task says: not so is {listing(lost)}. It is so with "
-                f"MuJoCo {PUBLISHED_MUJOCO}: {MEND}."
-            )
+    def tell_departures(self, episode: SimulatedEpisode, departures: Departures) -> None:
+        """Say, once a task, that a scene did not begin as in the published evaluations."""
+        task_id, said = episode.job.begins_as[0], describe_departures(departures.lost_relations, departures.displaced)
+        if said and task_id not in self._told_of_departures:
+            self._told_of_departures.add(task_id)
+            mend = f" {MEND} mends it." if what_differs(self.machine.get("mujoco", "")) else ""
+            self.say(f"WARNING: at the beginning of {episode.title} {' and '.join(said)}.{mend}")
 
     def learn_resets(self, task_id: int, resets: Sequence[object]) -> None:
         """Keep what a simulator knows of a task's resets, for the others."""
@@ -267,7 +265,7 @@ class SimulatedEpisode(Episode):
     _replan: int = field(default=0, init=False)
     _success: bool = field(default=False, init=False)
     _moments: list[Moment] = field(default_factory=list, init=False)
-    _lost_relations: tuple[str, ...] = field(default=(), init=False)
+    _departures: Departures = field(default=NO_DEPARTURES, init=False)
     _executed: list[NDArray[np.float64]] = field(default_factory=list, init=False)
     _closed: bool = field(default=False, init=False)
 
@@ -340,8 +338,9 @@ class SimulatedEpisode(Episode):
         self.done += result.steps
         self._success = result.success
         self._moments += result.moments
-        self._lost_relations += result.lost_relations
-        self.source.tell_lost_relations(self, result.lost_relations)
+        if not result.steps:  # the waiting steps
+            self._departures = result.departures
+            self.source.tell_departures(self, result.departures)
         if self._success or self.done >= self.source.protocol.max_steps:
             return Outcome(self._success, self.done, self._steps())
         if result.seen is None:
@@ -387,7 +386,8 @@ class SimulatedEpisode(Episode):
                 tuple(map(_first, touched.T)),
                 tuple(goals),
                 self.source.machine.get("mujoco", ""),
-                self._lost_relations,
+                self._departures.lost_relations,
+                self._departures.displaced,
             ),
             poses=np.stack([moment.poses for moment in self._moments]),
             gripper=np.stack([moment.gripper for moment in self._moments]),

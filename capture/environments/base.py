@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from vla_attention.schemas.episode_steps import TaskGoal
+    from vla_attention.schemas.episode_steps import Displaced, TaskGoal
     from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 #: Name of the scene object that stands for the arm, its gripper and its mount.
@@ -132,6 +132,18 @@ class Moment:
     held: NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class Departures:
+    """How a scene is not that of the published evaluations; both as in `EpisodeSteps`."""
+
+    lost_relations: tuple[str, ...] = ()
+    displaced: tuple[Displaced, ...] = ()
+
+
+#: None are known.
+NO_DEPARTURES = Departures()
+
+
 class Environment(Protocol):
     """One task in one simulator.
 
@@ -200,8 +212,8 @@ class TellsMoments(Protocol):
     def moment(self) -> Moment:
         """Return what holds after the last step, or after the reset."""
 
-    def lost_relations(self) -> tuple[str, ...]:
-        """Return what should be so after the waiting steps and is not; see `EpisodeSteps.lost_relations`."""
+    def departures(self) -> Departures:
+        """Return how the scene after the waiting steps is not that of the published evaluations, as far as known."""
 
 
 def initial_state_seed(scenes: str, index: int) -> int:

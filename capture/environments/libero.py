@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import EnvironmentSettings, Task
+from vla_attention.capture.environments.base import NO_DEPARTURES, Departures, EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_assets import find_assets
-from vla_attention.capture.environments.libero_beginnings import relations_of
+from vla_attention.capture.environments.libero_beginnings import beginning_of
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
 from vla_attention.capture.environments.libero_pro import (
     check_pro_assets,
@@ -25,7 +25,7 @@ from vla_attention.capture.environments.libero_pro import (
 )
 from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
 from vla_attention.capture.foreign_files.checked_files import check_regular
-from vla_attention.schemas.episode_steps import TaskGoal
+from vla_attention.schemas.episode_steps import Displaced, TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError, look_up
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
@@ -208,10 +208,17 @@ class LiberoEnvironment(SimulatedEnvironment):
             goals.append(goal_of(task, map(" ".join, conditions), _subjects(of_interest, names)))
         return goals
 
-    def lost_relations(self) -> tuple[str, ...]:
-        """Return what the task's file says of the beginning and does not hold now; see `EpisodeSteps`."""
-        said = relations_of(self.task.suite, self.task.task_id, self._initial_state_index)
-        return tuple(one.text for one in said if not self._simulator._eval_predicate(list(one.words)))
+    def departures(self) -> Departures:
+        """Return how the scene is not that of the published evaluations after the waiting steps."""
+        expected = beginning_of(self.task.suite, self.task.task_id, self._initial_state_index)
+        if expected is None:
+            return NO_DEPARTURES
+        lost = [words for words in expected.relations if not self._simulator._eval_predicate(list(words))]
+        displaced = expected.displaced(dict(zip(self.bodies, self.moment().poses[:, :3], strict=True)))
+        return Departures(
+            tuple(f"{first} {predicate} {second}" for predicate, first, second in lost),
+            tuple(Displaced(name, round(distance, 3)) for name, distance in displaced.items()),
+        )
 
     def _held(self) -> Sequence[bool]:
         simulator = self._simulator

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import (
     BACKGROUND,
+    NO_DEPARTURES,
     ROBOT,
+    Departures,
     EnvironmentSettings,
     Moment,
     Observation,
@@ -283,9 +285,9 @@ class SimulatedEnvironment:
             held=np.array(self._held(), dtype=bool),
         )
 
-    def lost_relations(self) -> tuple[str, ...]:
-        """Return none: nothing is said of how the scene begins; see `TellsMoments`."""
-        return ()
+    def departures(self) -> Departures:
+        """Return none: it is not known how the scene should begin; see `TellsMoments`."""
+        return NO_DEPARTURES
 
     def _site_orientation(self, site: int) -> NDArray[np.float64]:
         """A site's quaternion (w, x, y, z). `eef_quat`, which policies get, is that of the body above the gripper."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.environments.base import Moment, StepResult
+from vla_attention.capture.environments.base import NO_DEPARTURES, Departures, Moment, StepResult
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS
 from vla_attention.schemas.episode_steps import HAND, POSE, TaskGoal
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -61,8 +61,8 @@ class ToldScene(StillScene):
         touches = self.steps >= WAIT_STEPS + 3
         return Moment(poses, np.full(2, 0.04, np.float32), np.array([False, touches]), np.array([False, touches]))
 
-    def lost_relations(self) -> tuple[str, ...]:
-        return ()
+    def departures(self) -> Departures:
+        return NO_DEPARTURES
 
 
 def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:

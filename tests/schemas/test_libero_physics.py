@@ -8,6 +8,7 @@ import pytest
 from msgspec import structs
 
 from tests.kit.stores import StoreSpec, small_steps, write_store
+from vla_attention.schemas.episode_steps import Displaced
 from vla_attention.schemas.libero_physics import MEND, PUBLISHED_MUJOCO, SimulatedScenes, simulated_with, what_differs
 from vla_attention.schemas.stores.reader import open_store
 
@@ -34,13 +35,19 @@ def test_objects_rest_elsewhere_from_3_4_on_and_floors_are_darker_from_3_3_3_on(
     assert ("rest elsewhere" in what_differs(version), "darker" in what_differs(version)) == (rests, floors)
 
 
-def scenes(tmp_path, suite, versions, lost):
-    """`SimulatedScenes` of a store whose episodes have these versions and lost relations."""
+def scenes(tmp_path, suite, versions, lost, displaced=None):
+    """What is said of a store whose episodes have these versions, lost relations and displaced objects."""
 
     def plant(spec, task, episode, steps):
         made = small_steps(spec, task, episode, steps)
         return replace(
-            made, attributes=structs.replace(made.attributes, mujoco=versions[episode], lost_relations=lost[episode])
+            made,
+            attributes=structs.replace(
+                made.attributes,
+                mujoco=versions[episode],
+                lost_relations=lost[episode],
+                displaced=(displaced or {}).get(episode, ()),
+            ),
         )
 
     store = open_store(
@@ -84,3 +91,10 @@ def test_without_steps_only_a_callers_own_loop_had_the_simulator(tmp_path):
     for loop, version in {"recorded": "3.8.1", "dataset": "", "openpi": ""}.items():
         assert simulated_with(structs.replace(protocol, name=loop), episode) == version
     assert simulated_with(structs.replace(protocol, name="recorded", suite="mine"), episode) == ""
+
+
+def test_displaced_objects_are_told_the_farthest_first(tmp_path):
+    near, far = (Displaced("ketchup", 0.05), Displaced("milk", 0.3)), (Displaced("ketchup", 0.54),)
+    said = scenes(tmp_path, "libero_10", ["3.8.1"] * 3, [()] * 3, {0: near, 2: far})
+    assert "in 2 of 3 episodes" in said
+    assert "(ketchup by 54 cm, milk by 30 cm)" in said

@@ -15,14 +15,15 @@ from vla_attention.capture.engine.call import Caller, record_of
 from vla_attention.capture.engine.simulation import StopCheck
 from vla_attention.capture.engine.simulators import Simulators, check_protocol, max_replans
 from vla_attention.capture.engine.source import EpisodeJob, Outcome
-from vla_attention.capture.environments.base import Moment, Observation, StepResult, Task
+from vla_attention.capture.environments.base import Departures, Moment, Observation, StepResult, Task
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import PolicyInput
 from vla_attention.capture.store.replan_records import ReplanRecord
-from vla_attention.schemas.episode_steps import TaskGoal
+from vla_attention.schemas.episode_steps import Displaced, TaskGoal
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import PatchGrid, Prompt, Role, SiteLayout, Span
+from vla_attention.schemas.libero_physics import MEND
 from vla_attention.schemas.stores.store_format import PolicyCameraView, Protocol, Recording
 
 LAYOUT = SiteLayout(
@@ -185,8 +186,9 @@ class WatchedEnvironment(FakeEnvironment):
             poses, np.zeros(2, np.float32), np.array([False, touched]), np.array([number == self.solved_after, touched])
         )
 
-    def lost_relations(self) -> tuple[str, ...]:
-        return ("cube on plate",) if len(self.actions) == WAIT_STEPS else ()
+    def departures(self) -> Departures:
+        assert len(self.actions) == WAIT_STEPS
+        return Departures(("cube on plate",), (Displaced("cube", 0.54),))
 
 
 def test_what_is_told_of_every_step_is_stored(monkeypatch, capsys) -> None:
@@ -200,7 +202,9 @@ def test_what_is_told_of_every_step_is_stored(monkeypatch, capsys) -> None:
     assert steps.attributes.bodies == ("hand", "cube")
     assert steps.attributes.first_touch == (None, 2)
     assert (steps.attributes.mujoco, steps.attributes.lost_relations) == ("3.8.1", ("cube on plate",))
-    assert capsys.readouterr().out.count("cube on plate") == 1
+    assert steps.attributes.displaced == (Displaced("cube", 0.54),)
+    said = capsys.readouterr().out
+    assert [said.count(part) for part in ("cube on plate", "cube by 54 cm", MEND)] == [1, 1, 1]
     assert [goal.first_held for goal in steps.attributes.goals] == [4, 2]
 
 

@@ -13,10 +13,10 @@ import pytest
 pytest.importorskip("libero")
 pytest.importorskip("robosuite")
 
-from vla_attention.capture.environments.base import EnvironmentSettings, Observation
+from vla_attention.capture.environments.base import NO_DEPARTURES, Departures, EnvironmentSettings, Observation
 from vla_attention.capture.environments.episode_protocol import CAMERAS, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.libero import LiberoEnvironment, load_initial_states, parent_of_region
-from vla_attention.capture.environments.libero_beginnings import read_numbers, relations_of, write_numbers
+from vla_attention.capture.environments.libero_beginnings import beginning_of
 from vla_attention.capture.environments.libero_installation import load_libero, package_folder
 from vla_attention.capture.environments.suites import find_suite, make_environment
 from vla_attention.schemas.errors import UnknownName
@@ -177,28 +177,39 @@ def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[
         environment.segmentation("agent_view")
 
 
-@pytest.mark.libero
-@pytest.mark.simulator
-def test_the_bowl_stands_on_the_ramekin_where_the_physics_is_that_of_the_published_evaluations(libero_assets) -> None:
-    environment = make_environment(find_suite("libero_spatial"), 5, EnvironmentSettings(libero_assets=libero_assets))
+def beginning(suite: str, task_id: int, assets: Path) -> Departures:
+    """How the first state of a task departs from the published evaluations."""
+    environment = make_environment(find_suite(suite), task_id, EnvironmentSettings(libero_assets=assets))
     assert isinstance(environment, LiberoEnvironment)
     try:
         run_episode(environment, 0, 0, ())
-        lost = environment.lost_relations()
-        place = dict(zip(environment.bodies, environment.moment().poses[:, :3], strict=True))
+        return environment.departures()
     finally:
         environment.close()
-    across = place["akita_black_bowl_1"][:2] - place["glazed_rim_porcelain_ramekin_1"][:2]
-    fallen = "rest elsewhere" in what_differs(version("mujoco"))
-    assert lost == (("akita_black_bowl_1 on glazed_rim_porcelain_ramekin_1",) if fallen else ())
-    assert (np.linalg.norm(across) > 0.03) == fallen
 
 
-def test_numbers_of_states_are_read_as_they_are_written() -> None:
-    for numbers in ([], [0], [0, 1, 2], [3, 5, 6, 7, 49], list(range(50))):
-        assert read_numbers(write_numbers(numbers)) == set(numbers)
-    known = [relations_of("libero_spatial", 5, state) for state in range(50)]
-    assert all(
-        ("on", "akita_black_bowl_1", "glazed_rim_porcelain_ramekin_1") in {one.words for one in of} for of in known
-    )
-    assert relations_of("libero_spatial", 5, 50) == relations_of("made_up", 5, 0) == ()
+@pytest.mark.libero
+@pytest.mark.simulator
+def test_scenes_begin_as_published_only_with_the_mujoco_of_the_published_evaluations(libero_assets) -> None:
+    found = beginning("libero_spatial", 5, libero_assets)
+    if "rest elsewhere" not in what_differs(version("mujoco")):
+        assert found == NO_DEPARTURES
+        return
+    assert found.lost_relations == ("akita_black_bowl_1 on glazed_rim_porcelain_ramekin_1",)
+    assert [(one.name, round(one.distance, 2)) for one in found.displaced] == [("akita_black_bowl_1", 0.04)]
+    thrown = {one.name: round(one.distance, 2) for one in beginning("libero_10", 7, libero_assets).displaced}
+    assert thrown["ketchup_1"] == 0.54
+
+
+def test_what_begins_otherwise_is_told_from_the_stored_beginnings() -> None:
+    first, last = (beginning_of("libero_spatial", 5, state) for state in (0, 49))
+    assert first is not None
+    assert last is not None
+    assert ("on", "akita_black_bowl_1", "glazed_rim_porcelain_ramekin_1") in first.relations
+    bowl, ramekin = first.places["akita_black_bowl_1"], first.places["glazed_rim_porcelain_ramekin_1"]
+    np.testing.assert_allclose(100 * (bowl - ramekin), [-1.45, 0.05, 3.51], atol=0.1)
+    assert first.displaced(first.places) == {}
+    moved = {**first.places, "plate_1": first.places["plate_1"] + [0.0, 0.03, 0.04], "bowl": np.zeros(3)}
+    assert first.displaced(moved) == pytest.approx({"plate_1": 0.05})
+    assert set(first.displaced(last.places)) <= set(first.places)
+    assert beginning_of("libero_spatial", 5, 50) is beginning_of("made_up", 5, 0) is None
