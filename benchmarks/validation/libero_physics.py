@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.validation.tables import fill_marks, markdown
-from vla_attention.capture.environments.base import EnvironmentSettings, Suite, Task
+from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.environments.episode_protocol import OPENPI, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.libero import LiberoEnvironment, parent_of_region, read_task_file, task_file
 from vla_attention.capture.environments.libero_beginnings import ELSEWHERE_M, FILE, PARTS
@@ -87,13 +87,13 @@ def measure(task: Task, assets: Path, folder: Path, seed: int, num_states: int) 
     print(task.suite, task.task_id, flush=True)
 
 
-def chosen(words: Sequence[str]) -> Iterator[tuple[Suite, Task]]:
+def chosen(words: Sequence[str]) -> Iterator[Task]:
     """The tasks of `SUITE` or `SUITE:TASK,TASK`; without any those of the five standard suites."""
     for word in words or [suite.name for suite in SUITES if suite.kind == "libero" and not suite.perturbs]:
         name, _, numbers = word.partition(":")
         suite = find_suite(name)
         wanted = set(map(int, numbers.split(","))) if numbers else set(range(suite.num_tasks))
-        yield from ((suite, task) for task in list_tasks(suite) if task.task_id in wanted)
+        yield from (task for task in list_tasks(suite) if task.task_id in wanted)
 
 
 def row_of(task: Task, one: Any, other: Any) -> dict[str, Any]:
@@ -144,9 +144,10 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
                     "; ".join(lost) or "-",
                 )
             )
+    far = f"{100 * ELSEWHERE_M:.0f} cm"
     return "\n\n".join(
         [
-            markdown(("suite", "tasks with an object more than 2 cm elsewhere", "states"), by_suite),
+            markdown(("suite", f"tasks with an object more than {far} elsewhere", "states"), by_suite),
             markdown(
                 (
                     "task",
@@ -197,7 +198,7 @@ def _run() -> int:
         return 0
     import mujoco
 
-    for _, task in chosen(given.tasks):
+    for task in chosen(given.tasks):
         measure(task, given.assets, given.work / mujoco.__version__, given.seed, given.states)
     return 0
 
