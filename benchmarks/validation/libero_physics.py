@@ -8,7 +8,7 @@
 
 `measure` goes on where it was ended; a task takes half a minute, and `SUITE:TASK,...` names some. `tell` writes the
 table of `docs/validation.md`, its rows beside this file, and `capture/environments/libero_beginnings.npz`, with which
-captures compare.
+captures compare; a task that DIR has not under both versions stays as it was.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.validation.tables import fill_marks, markdown
 from vla_attention.capture.environments.base import EnvironmentSettings, Task
@@ -162,19 +161,22 @@ def tables(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def tell(work: Path) -> None:
-    """Write rows, page, and what the published evaluations begin with."""
-    rows, kept = [], dict[str, NDArray[Any]]()
+    """Write rows, page, and what the published evaluations begin with; tasks that are not in DIR stay as they are."""
+    known = {(row["suite"], row["task"]): row for row in json.loads(ROWS.read_text(encoding="utf-8"))}
+    with np.load(FILE) as before:
+        kept = dict(before)
+    rows = []
     for suite in SUITES:
         for task in list_tasks(suite) if suite.kind == "libero" else ():
             name = f"{suite.name}_{task.task_id}"
             one, other = (work / version / f"{name}.npz" for version in (PUBLISHED_MUJOCO, OTHER_MUJOCO))
-            if not one.exists():
-                continue
-            mine = dict(np.load(one))
-            kept |= {f"{name}/{part}": mine[part] for part in PARTS}
-            kept[f"{name}/places"] = np.round(1000 * mine["places"]).astype(np.int16)
-            if other.exists():
+            if one.exists() and other.exists():
+                mine = dict(np.load(one))
+                kept |= {f"{name}/{part}": mine[part] for part in PARTS}
+                kept[f"{name}/places"] = np.round(1000 * mine["places"]).astype(np.int16)
                 rows.append(row_of(task, mine, dict(np.load(other))))
+            elif row := known.get((suite.name, task.task_id)):
+                rows.append(row)
     np.savez_compressed(FILE, **kept)  # type: ignore[arg-type]  # numpy's own has a keyword that is no array
     ROWS.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     fill_marks(PAGE, {"libero physics": tables(rows)})
