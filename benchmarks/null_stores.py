@@ -174,6 +174,7 @@ def _shown_words(generator: np.random.Generator, planted: float, tasks: int = 6,
     frame = frame.filter(is_word).join(noise, on=place).with_columns(
         pl.lit("s").alias("suite"), pl.lit("without").alias("kind"), pl.lit("word").alias("item_kind"),
         pl.lit("total").alias("reader"), pl.lit("").alias("selector"), pl.col("item").alias("condition"),
+        pl.col("item").alias("label"), pl.lit("").alias("instead"),
         minus_noise=pl.col("effect") - pl.col("noise"), times_noise=(pl.col("effect") / pl.col("noise")).log(),
         square=pl.col("effect") ** 2, gripper_square=pl.lit(0.0),
         **dict.fromkeys(("effect_chunk", "angle", "gripper_flips", "keys", "mass", "lift", "norm"), pl.lit(1.0)),

@@ -27,6 +27,12 @@ EffectItems = Literal["text", "cameras", "objects", "tokens", "groups", "prompts
 #: Whose queries no longer read it. `all`: nobody reads it. `action`: the action queries alone. `pictures`, `text`: the
 #: tokens of pictures, or of the prompt, before the denoise steps.
 EffectReaders = Literal["all", "action", "pictures", "text"]
+#: What is done to an item. `only`: all but it is cut. `random`: as many other keys are cut. `noise`: another seed.
+EffectChange = Literal["nothing", "noise", "without", "only", "random", "prompt", "image"]
+#: What an item is. `exchange`: a word for which another stands; of other sentences, what they are to the task's own.
+EffectItemKind = (
+    Literal["", "word", "exchange", "part", "text", "token", "camera", "pictures", "object", "group"] | PromptKind
+)
 
 
 class OtherPrompt(Document, frozen=True):
@@ -84,15 +90,37 @@ class EffectsRecorded(Document, frozen=True):
         return max(Counter(row.task_id for row in self.prompts).values(), default=0)
 
 
+class EffectItem(Document, frozen=True):
+    """What a condition takes away or exchanges, and whose queries no longer read it.
+
+    `name`: the word, camera, object or group; of a part of the prompt its role, of a token its site and number; empty
+    for all pictures, all text, and the whole sentence. `instead`: the word, sentence or kind of picture that
+    stands in its place. `reader`: empty where nothing is cut.
+    """
+
+    change: EffectChange
+    kind: EffectItemKind = ""
+    name: str = ""
+    instead: str = ""
+    reader: EffectReaders | Literal[""] = ""
+
+
 class EpisodeEffects(Document, frozen=True):
     """The effects of one episode: what its arrays `effects/change` and `SITE/cut` are of.
 
-    Entry i of these arrays is of replan `replan[i]` under `conditions[condition[i]]`. A replan without an entry of a
-    condition was not measured under it: the word is not in its prompt, the object is out of view, the replan was
-    skipped, or its calls were refused. `units`: how far a change of 1 moves the robot, by dimension of the action.
+    Entry i of these arrays is of replan `replan[i]` under `conditions[condition[i]]`, which is of the item at the same
+    place of `items`. A replan without an entry of a condition was not measured under it: the word is not in its prompt,
+    the object is out of view, the replan was skipped, or its calls were refused. `units`: how far a change of 1 moves
+    the robot, by dimension of the action.
     """
 
     conditions: tuple[Interventions, ...]
+    items: tuple[EffectItem, ...]
     units: tuple[Number, ...]
     replan: tuple[int, ...]
     condition: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Check that each condition has its item."""
+        if len(self.conditions) != len(self.items):
+            raise BadArgument(f"{len(self.conditions)} conditions have {len(self.items)} items; expected one for each.")

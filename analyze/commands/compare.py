@@ -183,8 +183,8 @@ def _needs(part: Compared) -> list[Finding]:
         return []
     rows = part.rows["effects"].filter(ALL, reader="total")
     said = [
-        f"{2.0 ** row['mean_other']:.2g} standard deviations {'with' if row['item_kind'] == 'exchange' else 'without'} "
-        f"{row['item']} (against {2.0 ** row['mean_first']:.2g})"
+        f"{2.0 ** row['mean_other']:.2g} standard deviations {'without' if row['kind'] == 'without' else 'with'} "
+        f"{row['label']} (against {2.0 ** row['mean_first']:.2g})"
         for row in _largest(rows).iter_rows(named=True)
     ]
     numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}

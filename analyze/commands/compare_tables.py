@@ -150,7 +150,7 @@ _WORD, _LAYER, _HEAD = Column("item", "text", "word"), Column("layer", "count"),
 _EACH = (
     (
         "effects",
-        [Column("item", "text", "without, or changed")],
+        [Column("label", "text", "without, or changed")],
         "How far the action moves, in standard deviations",
     ),
     ("objects", [Column("item", "text", "object")], "Attention to objects, over that of their area"),

@@ -150,7 +150,7 @@ def _noise_pairs(episode: StoredEpisode, actions: Array) -> list[tuple[Array, Ar
     effects = episode.attributes.effects
     if effects is None or not episode.has(CHANGE):
         return []
-    numbers = [i for i, one in enumerate(effects.conditions) if changes_noise_alone(one)]
+    numbers = [i for i, one in enumerate(effects.items) if one.change == "noise"]
     entries = np.flatnonzero(np.isin(effects.condition, numbers))
     if not entries.size:
         return []

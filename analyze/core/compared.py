@@ -22,7 +22,7 @@ from vla_attention.analyze.core.estimate import Scale, estimate, with_q
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
 from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.object_shares import object_values
-from vla_attention.analyze.core.recorded_effects import recorded_effects
+from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, float_values
@@ -38,7 +38,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "heads": (("layer", "head"), ()),
     "words": (("item",), ()),
     "objects": (("kind", "item"), ("kind",)),
-    "effects": (("item_kind", "item", "reader"), ("reader",)),
+    "effects": ((*ITEM, "reader"), ("reader",)),
 }
 #: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
 PAIR = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
@@ -182,11 +182,10 @@ def _effects(first: Run, other: Run) -> tuple[pl.DataFrame, pl.DataFrame] | None
         # An episode has few words to exchange: all together they say what none of them shows.
         is_exchange = pl.col("item_kind").is_in(["exchange", "exchanged"])
         exchanged = rows.filter(is_exchange, kind="prompt", reader="total").group_by(EPISODE_ID).agg(pl.mean("effect"))
-        exchanged = exchanged.with_columns(
-            item_kind=pl.lit("exchange"), item=pl.lit("any word exchanged"), reader=pl.lit("total")
-        )
+        any_word = {"kind": "prompt", "item_kind": "exchange", "label": "any word exchanged", "reader": "total"}
+        exchanged = exchanged.with_columns(**{name: pl.lit(any_word.get(name, "")) for name in (*ITEM, "reader")})
         rows = pl.concat([exchanged, rows.filter(pl.col("reader").is_in(["total", "direct"]))], how="diagonal")
-        tables.append(rows.select(*EPISODE_ID, "item_kind", "item", "reader", value=pl.col("effect").log(2.0)))
+        tables.append(rows.select(*EPISODE_ID, *ITEM, "reader", value=pl.col("effect").log(2.0)))
     return tables[0], tables[1]
 
 

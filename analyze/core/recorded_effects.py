@@ -21,7 +21,6 @@ from vla_attention.analyze.core.action_changes import (
     GRIPPER,
     ActionSpread,
     BaseEpisode,
-    changes_noise_alone,
     changes_of,
     root_mean_square_change,
     units_of_recorded,
@@ -37,26 +36,31 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.effects import CHANGE
-from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, plural
+from vla_attention.schemas.effects import CHANGE, EffectItem
+from vla_attention.schemas.errors import BadArgument, UnknownName, plural
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
-from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
-from vla_attention.schemas.interventions import Interventions, KeyKnockout
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.safe_text import visible
 
 #: Change of an unchanged call among those made together that float32 explains, in spreads; bfloat16 leaves .02 to .05.
 _MOST_ROUNDING = 1e-3
 #: Parts of an episode's time.
 TIME_PARTS = 10
-PICTURES, TEXT = "all pictures", "all text"
-#: Role of keys -> what they are called; unions of several are all text.
-_PARTS = {"image": PICTURES, "bos": "first token", "template": "fixed words of the prompt",
-          "instruction": "whole instruction", "state": "state digits"}  # fmt: skip
+#: Parts of the prompt, other sentences and pictures -> what they are called.
+_PARTS = {"bos": "first token", "template": "fixed words of the prompt", "instruction": "whole instruction",
+          "state": "state digits"}  # fmt: skip
+_SENTENCES = {"empty": "the instruction empty", "shuffled": "the instruction's words shuffled"}
+_PICTURES = {"blank": "grey", "mean": "as the task's mean"}
+#: Whose attention is cut -> how an effect without it is called.
+_READERS = {"all": "total", "action": "direct"}
 _EPISODE = (*EPISODE_ID[:2], "instruction", EPISODE_ID[2])
-#: What names a row: the condition as it was recorded, and what it changed.
-NAMES = ("condition", "kind", "item", "item_kind", "selector", "reader")
+#: What names a row: the condition as it was recorded, what it changed (`schemas.effects.EffectItem`), and how sentences
+#: call that.
+NAMES = ("condition", "kind", "item", "item_kind", "instead", "label", "selector", "reader")
+#: Of these, what tells items apart, whoever does not read them.
+ITEM = ("kind", "item_kind", "item", "instead", "label")
 _ATTENTION = ("keys", "mass", "lift", "norm")
 _VALUES: dict[str, Scale] = {
     **dict.fromkeys(("effect", "effect_chunk", "angle", *_ATTENTION, "noise"), "positive"),
@@ -90,10 +94,9 @@ class RecordedEffects:
 
         Returns:
             suite, task_id, instruction, episode_index, replan, env_step; begin, end (the part of the episode's time in
-            which the call's actions were executed, 0 to 1); condition, kind (without, only, random, noise, prompt,
-            image), item, item_kind (word, camera, object, part, pictures, text, exchange, ...), selector, reader;
-            `action_changes.CHANGES`; gripper_effect (the effect if the gripper alone had changed); and keys, mass, lift
-            and norm of the item in the same replan (norm: of its contribution to the residual stream).
+            which the call's actions were executed, 0 to 1); `NAMES`; `action_changes.CHANGES`; gripper_effect (the
+            effect if the gripper alone had changed); and keys, mass, lift and norm of the item in the same replan
+            (norm: of its contribution to the residual stream).
         """
         return frame_of_episodes(self.measured, _rows)
 
@@ -191,60 +194,36 @@ def recorded_effects(
 _NOT_SHOWN = "No effect that {} holds can be shown. {}"
 
 
-def described(given: Interventions, groups: Mapping[str, str]) -> dict[str, str | None]:
-    """What a condition changes: kind, item, item_kind, selector and reader. groups: name -> selector, of the run."""
-    changed = [bool(given.keys), bool(given.attention), given.prompt is not None, bool(given.images), bool(given.noise)]
-    kind, item, item_kind = "several", visible(given.describe()), "other"
-    selector = reader = None
-    if not any(changed):
-        kind = "nothing"
-    elif changes_noise_alone(given):
-        kind, item, item_kind = "noise", "another noise seed", "noise"
-    elif sum(changed) > 1:
-        pass
-    elif len(given.keys) == 1:
-        knockout = given.keys[0]
-        kind = "random" if knockout.random_seed is not None else "only" if knockout.keep else "without"
-        item, item_kind = _item_of(knockout.selector)
-        of_group = [name for name, selector in groups.items() if selector == knockout.selector]
-        if of_group and "_group_" in given.name:  # a group that is one of the other items has the name of that
-            item, item_kind = visible(of_group[0]), "group"
-        others = {"only": f"all but the {item.removeprefix('all ')}", "random": f"random keys, as many as {item}"}
-        item, selector, reader = others.get(kind, item), visible(knockout.selector), _reader_of(knockout)
-    elif given.prompt is not None:
-        kind, item_kind = "prompt", given.prompt.meaning or "exchange"
-        if given.prompt.kind == "synonyms":
-            item = visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
-        elif given.prompt.text:
-            item = visible(f"'{given.prompt.text}'")
-    elif len(given.images) == 1:
-        kind, item_kind, image = "image", "exchange", given.images[0]
-        how = {"blank": "grey", "mean": "as the task's mean"}.get(image.kind, image.kind)
-        item = visible(f"{image.camera} {how}")
-    return {"kind": kind, "item": item, "item_kind": item_kind, "selector": selector, "reader": reader}
+def named(item: EffectItem, given: Interventions) -> dict[str, str | None]:
+    """`NAMES` of a condition."""
+    name, instead = visible(item.name), visible(item.instead)
+    return {
+        "condition": visible(given.name),
+        "kind": item.change,
+        "item": name,
+        "item_kind": item.kind,
+        "instead": instead,
+        "label": _label(item.change, item.kind, name, instead),
+        "selector": visible(given.keys[0].selector) if given.keys else None,
+        "reader": _READERS.get(item.reader, item.reader or None),
+    }
 
 
-def _item_of(selector: str) -> tuple[str, str]:
-    """What a selector takes: its name, and of which kind it is."""
-    try:
-        atoms = atoms_of(parse_selector(selector))
-    except UserError:  # of another version's grammar: it is named as it stands
-        return visible(selector), "other"
-    kinds = {atom.kind for atom in atoms}
-    if kinds == {"role"} and "role:image" not in selector and len(atoms) > 1:
-        return TEXT, "text"
-    if len(atoms) != 1:
-        return visible(selector), "other"
-    kind, name = atoms[0].kind, visible(atoms[0].argument)
-    if kind == "role":
-        return _PARTS.get(name, name), "pictures" if name == "image" else "part"
-    return (f"'{name}'" if kind == "word" else name), kind
-
-
-def _reader_of(knockout: KeyKnockout) -> str:
-    if knockout.queries == "prefix":
-        return "pictures" if knockout.query_selector == "role:image" else "text"
-    return "total" if knockout.queries == "all" else "direct"
+def _label(change: str, kind: str, name: str, instead: str) -> str:
+    """What a condition changed, as a sentence names it."""
+    if change == "noise":
+        return "another noise seed"
+    if change == "prompt":
+        said = f"'{instead}'" if instead else _SENTENCES.get(kind, kind)
+        return f"'{name}' as {said}" if kind == "exchange" else said
+    if change == "image":
+        return f"{name} {_PICTURES.get(instead, instead)}"
+    of_kind = {"pictures": "all pictures", "text": "all text", "word": f"'{name}'", "token": f"token {name}",
+               "object": name.replace("_", " ")}  # fmt: skip
+    said = _PARTS.get(name, name) if kind == "part" else of_kind.get(kind, name)
+    if change == "only":
+        return f"all but the {kind if kind in ('pictures', 'text') else said}"
+    return f"random keys, as many as {said}" if change == "random" else said
 
 
 def _places(question: Question) -> list[tuple[Question, tuple[str, ...]]]:
@@ -350,10 +329,8 @@ def _rows(one: _Episode) -> pl.DataFrame:
     item, arrays, measured = one
     effects = item.episode.attributes.effects
     assert effects is not None
-    recorded = item.store.attributes.recording.effects
-    groups = {} if recorded is None else recorded.groups
-    named = [{"condition": visible(given.name), **described(given, groups)} for given in effects.conditions]
-    conditions = pl.DataFrame(named, schema=dict.fromkeys(NAMES, pl.String))[arrays["condition"]]
+    names = [named(of, given) for of, given in zip(effects.items, effects.conditions, strict=True)]
+    conditions = pl.DataFrame(names, schema=dict.fromkeys(NAMES, pl.String))[arrays["condition"]]
     keys = episode_columns(item, _EPISODE, len(conditions))
     place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}
     values = {name: arrays["changes"][:, i] for i, name in enumerate(CHANGES)} | {"gripper_effect": arrays["gripper"]}
@@ -398,7 +375,7 @@ def _drift(episodes: Sequence[_Episode]) -> tuple[str, ...]:
     for item, arrays, _ in episodes:
         effects = item.episode.attributes.effects
         assert effects is not None
-        nothing = [i for i, given in enumerate(effects.conditions) if given.is_none]
+        nothing = [i for i, of in enumerate(effects.items) if of.change == "nothing"]
         sizes = np.where(np.isin(arrays["condition"], nothing), arrays["changes"][:, CHANGES.index("effect_chunk")], 0)
         if sizes.size and sizes.max() > most:
             most = float(sizes.max())

@@ -23,7 +23,7 @@ from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.measure import means
-from vla_attention.analyze.core.recorded_effects import NAMES, described, recorded_effects
+from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question, ask
@@ -335,8 +335,8 @@ class ShownEpisode:
     def drawn_effects(self) -> list[int]:
         """The conditions whose actions the page draws: the calls without an item, or with another."""
         effects = self.episode.attributes.effects
-        conditions = effects.conditions if effects is not None and self.episode.has(CHANGE) else ()
-        return [i for i, one in enumerate(conditions) if described(one, {})["kind"] in ("without", "prompt", "image")]
+        items = effects.items if effects is not None and self.episode.has(CHANGE) else ()
+        return [i for i, one in enumerate(items) if one.change in ("without", "prompt", "image")]
 
     def changed_actions(self, number: int) -> Array:
         """The actions of a condition's calls, (replan, step, dimension); NaN where it was not tried."""

@@ -145,7 +145,7 @@ def logged(shown: ShownEpisode, about: Mapping[str, Any], effects: Sequence[Mapp
         yield from _words(before, maps, effects, starts)
         yield from _groups(before, shown.groups(site, MEAN, MEAN), starts)
     for kind in _kinds(effects):
-        curves = {item["item"]: item["effect"] for item in effects if item["item_kind"] == kind}
+        curves = {item["label"]: item["effect"] for item in effects if _kind(item) == kind}
         yield from _series(("effects", kind), starts, curves)
     yield from _scene(shown)
     yield from _actions(shown, about)
@@ -223,7 +223,12 @@ def shown_effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, An
 
 
 def _kinds(effects: Sequence[Mapping[str, Any]]) -> list[str]:
-    return list(dict.fromkeys(item["item_kind"] for item in effects))
+    return list(dict.fromkeys(map(_kind, effects)))
+
+
+def _kind(item: Mapping[str, Any]) -> str:
+    """Under which an effect is drawn: what is taken away, or how the call is changed otherwise."""
+    return str(item["item_kind"] if item["kind"] == "without" else item["kind"])
 
 
 def _pictures(
@@ -250,7 +255,7 @@ def _words(
     before: tuple[str, ...], maps: EpisodeMaps, effects: Sequence[Mapping[str, Any]], starts: Sequence[int]
 ) -> Iterator[Logged]:
     """Every word's attention, as a series and in a table beside its effect; a word that comes twice has a number."""
-    effect_of = {item["item"].casefold(): item["effect"] for item in effects if item["item_kind"] == "word"}
+    effect_of = {item["item"]: item["effect"] for item in effects if _kind(item) == "word"}
     curves: dict[str, list[float | None]] = {}
     for replan, words in enumerate(maps.words):
         lines, seen = ["| word | times even | effect |", "|---|---:|---:|"], Counter[str]()
@@ -259,7 +264,7 @@ def _words(
             seen[text] += 1
             name = text if seen[text] == 1 else f"{text} ({seen[text]})"
             curves.setdefault(name, [None] * len(starts))[replan] = lift
-            tried = effect_of.get(f"'{text.casefold()}'")  # effects name words in lower case
+            tried = effect_of.get(text.casefold())  # effects name words in lower case
             effect = None if tried is None else tried[replan]
             lines.append(f"| {text} | {lift:.2f} | {'' if effect is None else f'{effect:.2f}'} |")
         table = {"text": "\n".join(lines), "media_type": _MARKDOWN}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import get_args
@@ -13,7 +14,7 @@ from vla_attention.capture.interventions.condition_name import condition_name, k
 from vla_attention.capture.interventions.prompts import with_synonyms
 from vla_attention.capture.interventions.resolution import run_vocabularies
 from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy
-from vla_attention.schemas.effects import EffectItems, EffectReaders, EffectsRecorded
+from vla_attention.schemas.effects import EffectItem, EffectItemKind, EffectItems, EffectReaders, EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS, find_grouping
 from vla_attention.schemas.groupings.grouping import REST
@@ -115,7 +116,7 @@ def conditions_of(
     siblings: Sequence[str],
     task_id: int,
     with_mean: Collection[str] = (),
-) -> tuple[Interventions, ...]:
+) -> tuple[tuple[Interventions, EffectItem], ...]:
     """Return the conditions of an episode, from its first call: the unchanged call, other noise, then every item.
 
     tokens, vocabularies: by site. objects: of the scene. siblings: the instructions of the other tasks of the task's
@@ -127,33 +128,44 @@ def conditions_of(
     for group in _groups(planned, policy, tokens, vocabularies, objects, words):
         # A group of a grouping may be one of the other items: it is measured once.
         known = groups.setdefault(group.selector, group)
-        groups[group.selector] = _Group(known.name, group.selector, alone=known.alone or group.alone)
+        groups[group.selector] = dataclasses.replace(known, alone=known.alone or group.alone)
     controlled = _controlled(planned, words)
     # Calls that are made one by one are the same to the bit: only a batch needs the unchanged one among them.
-    conditions = [UNCHANGED] if isinstance(policy, VariantPolicy) else []
-    conditions.append(Interventions("noise", noise=NoiseChange(planned.seed)))
+    conditions = [(UNCHANGED, EffectItem("nothing"))] if isinstance(policy, VariantPolicy) else []
+    conditions.append((Interventions("noise", noise=NoiseChange(planned.seed)), EffectItem("noise")))
     for reader in planned.readers:
         queries, query_selector = _READERS[reader]
         for selector, group in groups.items():
             knockout = KeyKnockout(selector, queries=queries, query_selector=query_selector)
-            conditions.append(knockout_of_group("without", group.name, knockout))
+            item = EffectItem("without", group.kind, group.item, reader=reader)
+            conditions.append((knockout_of_group("without", group.name, knockout), item))
             if group.alone and queries != "prefix":
-                conditions.append(knockout_of_group("only", group.name, replace(knockout, keep=True)))
+                alone = knockout_of_group("only", group.name, replace(knockout, keep=True))
+                conditions.append((alone, replace(item, change="only")))
         for selector in controlled:
             random = KeyKnockout(selector, queries=queries, query_selector=query_selector, random_seed=planned.seed)
-            conditions.append(knockout_of_group("random", groups[selector].name, random))
+            item = EffectItem("random", groups[selector].kind, groups[selector].item, reader=reader)
+            conditions.append((knockout_of_group("random", groups[selector].name, random), item))
     instruction, rows = policy_input.prompt.instruction_text, [row for row in planned.prompts if row.task_id == task_id]
     changes = [row.change for row in rows]
     if "text" in planned.items:
         told = {folded_words(row.sentence) for row in rows}
         exchanged = exchanges(instruction, siblings)
         changes += [one for one in exchanged if folded_words(with_synonyms(instruction, one.synonyms)) not in told]
-    conditions += [_named(Interventions(prompt=change)) for change in changes]
+    conditions += [(_named(Interventions(prompt=change)), _exchanged(change)) for change in changes]
     if "cameras" in planned.items:
         for camera in policy_input.frames:
             change = ImageChange(camera, "mean" if camera in with_mean else "blank")
-            conditions.append(_named(Interventions(images=(change,))))
+            item = EffectItem("image", "camera", camera, change.kind)
+            conditions.append((_named(Interventions(images=(change,))), item))
     return tuple(conditions)
+
+
+def _exchanged(change: PromptChange) -> EffectItem:
+    """Return what a prompt exchanges: a word for another, or the sentence."""
+    for word, other in change.synonyms.items():
+        return EffectItem("prompt", "exchange", word, other)
+    return EffectItem("prompt", change.meaning, instead=change.text)
 
 
 def _named(interventions: Interventions) -> Interventions:
@@ -162,10 +174,12 @@ def _named(interventions: Interventions) -> Interventions:
 
 @dataclass(frozen=True)
 class _Group:
-    """Keys that are cut off. alone: everything but them is cut off, too."""
+    """Keys that are cut off: how the condition and the item are called. alone: everything but them is cut off, too."""
 
     name: str
     selector: str
+    kind: EffectItemKind
+    item: str = ""
     alone: bool = False
 
 
@@ -182,9 +196,9 @@ def _groups(
         return any((group[0] * tokens[site].valid[0]).any() for site, group in weights.items())
 
     if "text" in planned.items:
-        yield _Group("linguistic", TEXT_KEYS, alone=True)
-        yield from (_Group(part, f"role:{part}") for part in _PARTS if has_keys(f"role:{part}"))
-        yield from (_Group(f"word_{text}", _of_word(text)) for text in dict.fromkeys(_texts(words)))
+        yield _Group("linguistic", TEXT_KEYS, "text", alone=True)
+        yield from (_Group(part, f"role:{part}", "part", part) for part in _PARTS if has_keys(f"role:{part}"))
+        yield from (_Group(f"word_{text}", _of_word(text), "word", text) for text in dict.fromkeys(_texts(words)))
     if "tokens" in planned.items:
         of_words = {key for word in words for key in word.keys}
         for site, of_site in tokens.items():
@@ -192,14 +206,17 @@ def _groups(
                 prompt_keys = [piece.key for piece in of_site.prompts[0].pieces if piece.key not in of_words]
                 # Another site has keys of the same numbers, which are others.
                 within = "" if len(tokens) == 1 else f"{_text_spans(of_site)} & "
-                yield from (_Group(f"{site}_key_{key}", f"{within}keys:{key}-{key}") for key in prompt_keys)
+                for key in prompt_keys:
+                    name = f"{key} of {site}" if within else f"{key}"
+                    yield _Group(f"{site}_key_{key}", f"{within}keys:{key}-{key}", "token", name)
     if "cameras" in planned.items:
-        yield _Group("visual", "role:image", alone=True)
-        yield from (_Group(f"camera_{camera.name}", f"camera:{camera.name}") for camera in policy.cameras)
+        yield _Group("visual", "role:image", "pictures", alone=True)
+        for camera in policy.cameras:
+            yield _Group(f"camera_{camera.name}", f"camera:{camera.name}", "camera", camera.name)
     if "objects" in planned.items:
-        yield from (_Group(f"object_{thing.name}", f'object:"{thing.name}"') for thing in objects)
+        yield from (_Group(f"object_{thing.name}", f'object:"{thing.name}"', "object", thing.name) for thing in objects)
     for name, selector in planned.groups.items():
-        yield _Group(f"group_{plain(name)}", selector, alone=True)
+        yield _Group(f"group_{plain(name)}", selector, "group", name, alone=True)
 
 
 def _groups_of(grouping: str, sites: Sequence[SiteLayout]) -> dict[str, str]:

@@ -34,7 +34,7 @@ from vla_attention.capture.policies.policy import (
 )
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.effects import EffectsRecorded
+from vla_attention.schemas.effects import EffectItem, EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, UserError, plural
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
@@ -200,6 +200,7 @@ class EpisodeEffectsMeasured:
 
     run: EffectMeasurement
     conditions: tuple[Interventions, ...] | None = None
+    items: tuple[EffectItem, ...] = ()
     instruction: str = ""
 
     def measure(
@@ -225,7 +226,7 @@ class EpisodeEffectsMeasured:
         vocabularies = run_vocabularies(policy.sites, instructions, objects)
         if self.conditions is None:
             siblings = self.run.siblings.get(context.task_id, ())
-            self.conditions = conditions_of(
+            made = conditions_of(
                 planned,
                 policy,
                 policy_input,
@@ -236,6 +237,7 @@ class EpisodeEffectsMeasured:
                 context.task_id,
                 context.mean_pictures,
             )
+            self.conditions, self.items = tuple(one for one, _ in made), tuple(item for _, item in made)
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
                 self.run.say_once(self.run.no_siblings)
             if "objects" in planned.items and not (context.objects and context.coverage):
@@ -249,12 +251,14 @@ class EpisodeEffectsMeasured:
         for name, selector in planned.groups.items():
             if selector not in cut:
                 self.run.say_once(f"The group '{name}' has no key at some replans: it is not measured there.")
-        made = self.run.actions_of(variants)
+        actions_of = self.run.actions_of(variants)
         if planned.denoise_steps < policy.num_denoise_steps:
             # Fewer steps change the actions by themselves: the same call with as many steps is what effects are of.
             unchanged = self.conditions.index(UNCHANGED)
-            actions = made.pop(unchanged, actions)
-        changes = {number: ((given - actions) / self.run.units).astype(np.float32) for number, given in made.items()}
+            actions = actions_of.pop(unchanged, actions)
+        changes = {
+            number: ((given - actions) / self.run.units).astype(np.float32) for number, given in actions_of.items()
+        }
         measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
         weights = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
@@ -268,9 +272,8 @@ class EpisodeEffectsMeasured:
             else np.zeros((0, *actions.shape), np.float32)
         )
         self.run.seconds.append(time.perf_counter() - begun)
-        return ReplanEffects(
-            self.conditions, tuple(float(unit) for unit in self.run.units), tuple(measured), change, weights
-        )
+        units = tuple(float(unit) for unit in self.run.units)
+        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights)
 
     def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
         pictures = self.run.pictures

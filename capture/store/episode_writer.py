@@ -247,6 +247,7 @@ class EpisodeWriter:
             if not measured
             else EpisodeEffects(
                 measured[0][1].conditions,
+                measured[0][1].items,
                 measured[0][1].units,
                 tuple(replan for replan, of in measured for _ in of.measured),
                 tuple(number for _, of in measured for number in of.measured),

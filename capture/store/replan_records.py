@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.effects import CHANGE, CUT
+from vla_attention.schemas.effects import CHANGE, CUT, EffectItem
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, EpisodeSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
@@ -51,12 +51,13 @@ class RecordedRows:
 class ReplanEffects:
     """The effects of one replan.
 
-    conditions: of the episode, the same at all its replans. units: see `EpisodeEffects`. measured: the numbers of the
-    conditions that were measured, ascending. change: (measured, horizon, action dim) float32, actions under the
+    conditions, items: of the episode, the same at all its replans. units: see `EpisodeEffects`. measured: the numbers
+    of the conditions that were measured, ascending. change: (measured, horizon, action dim) float32, actions under the
     condition minus actions, in `units`. cut: site -> (measured, key) float32, the weights of the keys that were cut.
     """
 
     conditions: tuple[Interventions, ...]
+    items: tuple[EffectItem, ...]
     units: tuple[float, ...]
     measured: tuple[int, ...]
     change: NDArray[np.float32]

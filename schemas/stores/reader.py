@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import Note, listing
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
@@ -32,6 +32,7 @@ from vla_attention.schemas.stores.store_format import (
     EpisodeAttributes,
     EpisodeSeal,
     RootAttributes,
+    StoreError,
     episode_name,
     parse_episode_name,
 )
@@ -74,8 +75,14 @@ class StoredEpisode:
         """The episode's attributes."""
         document = self.document("zarr.json")
         try:
-            attributes = from_json(EpisodeAttributes, attributes_in(document))
-        except ValueError as error:
+            given = attributes_in(document)
+            if isinstance(effects := given.get("effects"), dict) and "conditions" in effects and "items" not in effects:
+                raise StoreError(
+                    f"The effects of episode {self.name} were recorded before they named their items; bring the store "
+                    "up to date: python scripts/convert_effects.py STORE (of the project's repository)."
+                )
+            attributes = from_json(EpisodeAttributes, given)
+        except MalformedDocument as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
         stated = episode_name(attributes.task_id, attributes.episode_index)
         if stated != self.name:

@@ -10,6 +10,7 @@ from tests.kit.stores import PlantEffects
 from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.capture.interventions.condition_name import knockout_of_group
 from vla_attention.capture.store.replan_records import ReplanEffects
+from vla_attention.schemas.effects import EffectItem
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
@@ -33,18 +34,23 @@ ITEMS = {
 NOISE, RANDOM = 0.05, 0.02
 
 
-def conditions() -> dict[Interventions | str, tuple[Interventions, float]]:
-    planted = {"unchanged": (Interventions("unchanged"), 0.0)}
-    planted["noise"] = (Interventions("noise", noise=NoiseChange(1)), NOISE)
+def item_of(name: str, change: str, queries: str, readers: str) -> EffectItem:
+    kind, item = {"visual": ("pictures", ""), "linguistic": ("text", "")}.get(name, ("word", name[len("word_") :]))
+    return EffectItem(change, kind, item, reader="pictures" if readers else queries)
+
+
+def conditions() -> dict[str, tuple[Interventions, EffectItem, float]]:
+    planted = {"unchanged": (Interventions("unchanged"), EffectItem("nothing"), 0.0)}
+    planted["noise"] = (Interventions("noise", noise=NoiseChange(1)), EffectItem("noise"), NOISE)
     for name, (selector, sizes) in ITEMS.items():
         for reader, (queries, readers) in READERS.items():
             one = KeyKnockout(selector, queries=queries, query_selector=readers)
             made = knockout_of_group("without", name, one)
-            planted[made.name] = (made, sizes[reader])
+            planted[made.name] = (made, item_of(name, "without", queries, readers), sizes[reader])
     for queries, readers in READERS.values():
         one = KeyKnockout(f'word:"{FIRST}"', queries=queries, query_selector=readers, random_seed=1)
         made = knockout_of_group("random", f"word_{FIRST}", one)
-        planted[made.name] = (made, RANDOM)
+        planted[made.name] = (made, item_of(f"word_{FIRST}", "random", queries, readers), RANDOM)
     return planted
 
 
@@ -66,7 +72,7 @@ def _effects_of(
     known = INSTRUCTIONS[task % len(INSTRUCTIONS)].split()
     all_of = conditions()
     measured, changes = [], []
-    for number, (name, (_, size)) in enumerate(all_of.items()):
+    for number, (name, (*_, size)) in enumerate(all_of.items()):
         word = name.split("word_")[-1].split("_queries")[0] if "word_" in name else known[0]
         if word in known:
             measured.append(number)
@@ -82,6 +88,6 @@ def _effects_of(
         name = list(all_of)[number]
         if name.startswith("without_"):
             row[:] = keys_of[name.removeprefix("without_").split("_queries")[0]]
-    listed = tuple(one for one, _ in all_of.values())
+    listed, items = (tuple(of) for of in list(zip(*all_of.values(), strict=True))[:2])
     change = np.array(changes, np.float32)
-    return ReplanEffects(listed, (3.0,) * 7, tuple(measured), change, {"joint": cut})
+    return ReplanEffects(listed, items, (3.0,) * 7, tuple(measured), change, {"joint": cut})

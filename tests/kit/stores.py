@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 import zarr
+from msgspec import structs
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, Crc32cCodec
 
@@ -30,7 +31,7 @@ from vla_attention.capture.store.replan_records import (
     ReplanRecord,
 )
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
-from vla_attention.schemas.effects import EffectsRecorded
+from vla_attention.schemas.effects import EffectItem, EffectsRecorded
 from vla_attention.schemas.episode_steps import HAND, EpisodeSteps, TaskGoal
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -337,6 +338,9 @@ SMALL_CONDITIONS = (
     Interventions("without_instruction", keys=(KeyKnockout("role:instruction"),)),
     Interventions("random_instruction", keys=(KeyKnockout("role:instruction", random_seed=1),)),
 )
+_ITEM = EffectItem("without", "part", "instruction", reader="all")
+SMALL_ITEMS = (EffectItem("nothing"), EffectItem("noise"), _ITEM, structs.replace(_ITEM, reader="action"),
+               structs.replace(_ITEM, change="random", reader="action"))  # fmt: skip
 
 
 def small_effects(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
@@ -346,7 +350,7 @@ def small_effects(task: int, episode: int, replan: int, tokens: EpisodeTokens) -
     change[0] = 0.0
     cut = np.zeros((len(measured), tokens.layout.num_keys), np.float32)
     cut[2:] = tokens.key_role[replan] == Role.INSTRUCTION
-    return ReplanEffects(SMALL_CONDITIONS, (2.0,) * 7, measured, change.astype(np.float32), {"joint": cut})
+    return ReplanEffects(SMALL_CONDITIONS, SMALL_ITEMS, (2.0,) * 7, measured, change.astype(np.float32), {"joint": cut})
 
 
 def small_steps(spec: StoreSpec, task: int, episode: int, steps: int) -> RecordedSteps:

@@ -9,6 +9,7 @@ import polars as pl
 from vla_attention.analyze.commands.effects.data_set import deviation, has_dataset_actions
 from vla_attention.analyze.commands.effects.items import (
     FEW,
+    IS_WORD,
     LESS,
     MORE,
     NO_NOISE,
@@ -25,7 +26,7 @@ from vla_attention.analyze.core.about import about, enough, how_to_record_effect
 from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
 from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.recorded_effects import PICTURES, TEXT, RecordedEffects, recorded_effects, summary_of
+from vla_attention.analyze.core.recorded_effects import ITEM, RecordedEffects, recorded_effects, summary_of
 from vla_attention.analyze.core.result import Figure, Finding, Result, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
@@ -36,6 +37,8 @@ _MISSING = "What if a word is left out?"
 _MOST_NAMED, _MOST_DRAWN = 5, 4
 #: From this part of a squared effect on, it is said that it is the gripper's.
 _HALF = 0.5
+_SIDES = ("pictures", "text")
+_OF_SIDE = pl.col("item_kind").is_in(_SIDES)
 
 
 def effects(question: Question, by: Collection[str] = ()) -> Result:
@@ -75,7 +78,7 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
         return [Finding(said, _MISSING, next_step=how_to_record_effects(question))], []
     episodes = found.episodes()
     items = with_untested(question, by_item(summary_of(episodes, question.sampling)))
-    table = items.filter(item_kind="word")
+    table = items.filter(IS_WORD)
     columns = [column for column in columns_of_items(table) if column.name != "lift"]
     otherwise, tables = other_sentences(question, episodes)
     findings = [*exchanged(question, episodes), *otherwise, deciding(table, found.spread)]
@@ -103,8 +106,8 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
             [],
         )
     items = with_untested(question, items)
-    is_word, of_prompt = pl.col("item_kind") == "word", pl.col("item").str.starts_with("'")
-    words, others = items.filter(is_word), items.filter(~of_prompt)
+    of_words = pl.col("item_kind").is_in(["word", "exchange"])
+    words, others = items.filter(IS_WORD), items.filter(~of_words)
     findings = [*exchanged(question, episodes), *otherwise, deciding(words, found.spread)]
     findings += [*_sides(question, episodes, items), *_others(others), *_ways(words)]
     findings += _unlike_attention(words)
@@ -122,7 +125,7 @@ def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
         return Finding("Not tested: no effect of a single word was recorded.", _MISSING, {}, " ".join(limits))
     sure, few = tested.filter(than_noise=MORE), tested.filter(than_noise=FEW)
     top = (sure if sure.height else tested).row(0, named=True)
-    without = f"{'Without' if top['reader'] == 'total' else 'Hidden from the action tokens,'} {top['item']}"
+    without = f"{'Without' if top['reader'] == 'total' else 'Hidden from the action tokens,'} {top['label']}"
     size = f"{with_interval(top, 'effect')} {UNIT}"
     noise = "" if top["noise"] is None else f" (another noise seed: {top['noise']:.2g})"
     if sure.height:
@@ -138,42 +141,42 @@ def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
         said = f"{without} the action changes most in these episodes: by {size}{noise}."
         said += f" Next: {_named(tested[1:])}." if tested.height > 1 else ""
     if few.height:
-        limits.insert(0, f"Too few episodes to say more of {listing(few['item'], _MOST_NAMED)}.")
+        limits.insert(0, f"Too few episodes to say more of {listing(few['label'], _MOST_NAMED)}.")
     numbers = {"word": top["item"], "estimate": top["effect"], "low": top["effect_low"], "high": top["effect_high"],
                "noise": top["noise"], "shown": sure.height, "tested": tested.height}  # fmt: skip
     if (top["grip_part"] or 0.0) >= _HALF:
-        said += f" The change without {top['item']} is {top['grip_part']:.0%} gripper: it is told the opposite in "
+        said += f" The change without {top['label']} is {top['grip_part']:.0%} gripper: it is told the opposite in "
         said += f"{top['grip']:.0%} of the steps, and as its commands hardly vary here (standard deviation "
         said += (
             f"{spread.spread[GRIPPER]:.2g}), that counts much; the hand's direction turns by {top['turn'] or 0.0:.0f} "
         )
         said += "degrees."
         turn = tested.sort("turn", descending=True, nulls_last=True).row(0, named=True)
-        if turn["item"] != top["item"] and turn["turn"] is not None:
-            said += f" The hand's direction turns most without {turn['item']}: by {turn['turn']:.0f} degrees."
+        if turn["label"] != top["label"] and turn["turn"] is not None:
+            said += f" The hand's direction turns most without {turn['label']}: by {turn['turn']:.0f} degrees."
     return Finding(said, _MISSING, numbers, " ".join(limits))
 
 
 def _named(rows: pl.DataFrame, value: str = "effect") -> str:
-    return listing([f"{item} ({size:.2g})" for item, size in rows.select("item", value).iter_rows()], _MOST_NAMED)
+    return listing([f"{item} ({size:.2g})" for item, size in rows.select("label", value).iter_rows()], _MOST_NAMED)
 
 
 def _sides(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> list[Finding]:
     """Without all pictures against without all text, in the episodes that have both."""
-    rows = episodes.filter(pl.col("item").is_in([PICTURES, TEXT]), kind="without", reader="total")
-    both = rows.pivot("item", index=EPISODE_ID, values="effect").with_columns(side=pl.lit("pictures / text"))
-    if not {PICTURES, TEXT} <= set(both.columns):
+    rows = episodes.filter(_OF_SIDE, kind="without", reader="total")
+    both = rows.pivot("item_kind", index=EPISODE_ID, values="effect").with_columns(side=pl.lit("pictures / text"))
+    if not {*_SIDES} <= set(both.columns):
         return []
-    sizes: dict[str, Scale] = {PICTURES: "positive", TEXT: "positive"}
-    row = estimate(both.drop_nulls(), ["side"], sizes, question.sampling, quotients={"ratio": (PICTURES, TEXT)})
+    sizes: dict[str, Scale] = dict.fromkeys(_SIDES, "positive")
+    row = estimate(both.drop_nulls(), ["side"], sizes, question.sampling, quotients={"ratio": _SIDES})
     one = row.row(0, named=True)
     if one["ratio"] is None:
         return []
     said = (
         f"Without all pictures the action changes {with_interval(one, 'ratio')} times as much as without all text "
-        f"({one[PICTURES]:.2g} and {one[TEXT]:.2g})."
+        f"({one['pictures']:.2g} and {one['text']:.2g})."
     )
-    mostly = items.filter(pl.col("item").is_in([PICTURES, TEXT]), pl.col("grip_part") >= _HALF)["item"].to_list()
+    mostly = items.filter(_OF_SIDE, pl.col("grip_part") >= _HALF, kind="without")["label"].to_list()
     said += (
         f" Without {mostly[0] if len(mostly) == 1 else 'either'}, most of the change is the gripper's."
         if mostly
@@ -203,14 +206,14 @@ def _ways(words: pl.DataFrame) -> list[Finding]:
     half = 2 * pl.col("direct") >= pl.col("total")
     own, rest = words.filter(half), words.filter(~half)
     seen = (2 * pl.col("pictures") >= pl.col("total")).fill_null(False)
-    parts = [f"the action tokens read {listing(own['item'], _MOST_NAMED)} themselves"] if own.height else []
+    parts = [f"the action tokens read {listing(own['label'], _MOST_NAMED)} themselves"] if own.height else []
     for is_it, through in ((seen, "the pictures, which have read it"), (~seen, "other tokens")):
         part = rest.filter(is_it)
         if part.height:
             sizes = sorted(part["direct"].to_list())
             alone = f"hidden from the action tokens alone: {sizes[0]:.2g}"
             alone += f" to {sizes[-1]:.2g}" if part.height > 1 else ""
-            parts.append(f"{listing(part['item'], _MOST_NAMED)} acts through {through} ({alone})")
+            parts.append(f"{listing(part['label'], _MOST_NAMED)} acts through {through} ({alone})")
     said = "; ".join(parts)
     return [Finding(f"{said[0].upper()}{said[1:]}.", "How do these words reach the action?")] if parts else []
 
@@ -236,11 +239,11 @@ def _left_out(spread: ActionSpread) -> list[str]:
 
 def _over_time(found: RecordedEffects, items: pl.DataFrame) -> pl.DataFrame:
     """Effects over the parts of an episode's time: of pictures, text, the largest words or other items, and noise."""
-    of_side = pl.col("item").is_in([PICTURES, TEXT])
-    words = items.filter(item_kind="word").drop_nulls("effect")
+    of_side = _OF_SIDE & pl.col("kind").is_in(["without", "only"])
+    words = items.filter(IS_WORD).drop_nulls("effect")
     largest = (words if words.height else items.filter(~of_side)).head(_MOST_DRAWN)
-    drawn = pl.concat([items.filter(of_side), largest])["condition"].drop_nulls().to_list()
+    drawn = pl.concat([items.filter(of_side, kind="without"), largest])["condition"].drop_nulls().to_list()
     rows = found.episodes(["time"]).filter(pl.col("condition").is_in(drawn) | (pl.col("kind") == "noise"))
-    course = estimate(rows, ["condition", "item", "reader", "phase"], {"effect": "positive"}, found.question.sampling)
+    course = estimate(rows, ["condition", *ITEM, "reader", "phase"], {"effect": "positive"}, found.question.sampling)
     order = pl.col("condition").replace_strict({name: i for i, name in enumerate(drawn)}, default=len(drawn))
     return course.sort(order, "condition", "phase")

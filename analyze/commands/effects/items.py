@@ -9,6 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.core.about import with_interval
 from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.recorded_effects import ITEM
 from vla_attention.analyze.core.result import Column, Figure, Finding
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
@@ -22,21 +23,25 @@ MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
 )  # fmt: skip
 _SHOWN_KINDS = ("without", "only", "prompt", "image")
 #: In the order of tables and pictures.
-_KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "exchange")
+_KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "token", "exchange")
 _READERS = ("total", "direct", "pictures", "text")
-_ALWAYS = ("item", "than_noise")
+_ALWAYS = ("label", "than_noise")
 UNIT = "standard deviations of the run's actions"
+
+
+#: The rows of calls without a word.
+IS_WORD = (pl.col("kind") == "without") & (pl.col("item_kind") == "word")
 
 
 def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
     """One row per item (and cell of the columns `looks`), words first, the largest effects of each kind first.
 
     Returns:
-        looks, item, item_kind, condition, reader; effect: that of the reader `total`, or where it was not recorded of
+        looks, `ITEM`, condition, reader; effect: that of the reader `total`, or where it was not recorded of
         `direct`; in its row of `RecordedEffects.summary` turn, grip, grip_part, lift, noise, q and num_episodes;
         than_noise; and the effect of every reader. Effects have intervals.
     """
-    names = [*looks, "item", "item_kind"]
+    names = [*looks, *ITEM]
     # Other sentences are no items: `prompts` has them, by what they are.
     is_item = pl.col("kind").is_in(_SHOWN_KINDS) & ~pl.col("item_kind").is_in(get_args(PromptKind))
     rows = summary.filter(is_item).with_columns(pl.col("reader").fill_null("total"))
@@ -74,21 +79,18 @@ def _with_ends(name: str, to: str = "") -> list[pl.Expr]:
 
 def with_untested(question: Question, items: pl.DataFrame) -> pl.DataFrame:
     """The items with the words of the instructions that were not tested, behind the others."""
-    spoken = {f"'{word.text.casefold()}'" for one in question.selected for line in one.tokens.words for word in line}
-    rows = [(word, "word", UNTESTED) for word in sorted(spoken - set(items["item"]))]
-    untested = pl.DataFrame(rows, schema=["item", "item_kind", "than_noise"], orient="row", schema_overrides=_TEXTS)
-    is_word = pl.col("item_kind") == "word"
-    return pl.concat([items.filter(is_word), untested, items.filter(~is_word)], how="diagonal")
-
-
-_TEXTS = dict.fromkeys(("item", "item_kind", "than_noise"), pl.String)
+    spoken = {word.text.casefold() for one in question.selected for line in one.tokens.words for word in line}
+    words, others = items.filter(IS_WORD), items.filter(~IS_WORD)
+    rows = [("without", "word", word, "", f"'{word}'", UNTESTED) for word in sorted(spoken - {*words["item"]})]
+    schema = dict.fromkeys((*ITEM, "than_noise"), pl.String)
+    return pl.concat([words, pl.DataFrame(rows, schema=schema, orient="row"), others], how="diagonal")
 
 
 def exchanged(question: Question, episodes: pl.DataFrame) -> list[Finding]:
     """Whether it tells words apart: how far the action moves with one exchanged for another, which tasks also have."""
     is_exchange = pl.col("item_kind").is_in(["exchange", "exchanged"])
     rows = episodes.filter(is_exchange, kind="prompt").group_by(*EPISODE_ID, maintain_order=True)
-    of_episodes = rows.agg(pl.mean("effect", "noise"), words=pl.col("item"))
+    of_episodes = rows.agg(pl.mean("effect", "noise"), words=pl.col("label"))
     if of_episodes.is_empty():
         return []
     of_episodes = of_episodes.with_columns(
@@ -118,17 +120,17 @@ def figures_of_items(items: pl.DataFrame, course: pl.DataFrame, summary: pl.Data
     floor = {} if noise is None else {"baseline": noise, "baseline_name": "another noise seed"}
     items = items.with_columns(color=pl.col("item_kind").replace({"camera": "pictures", "part": "text"}))
     by_kind, change = {"color": "color"}, "change (standard deviations)"
-    forest = {"value": "effect", "label": "item", "xlabel": change, "log": True, **floor, **by_kind}
+    forest = {"value": "effect", "label": "label", "xlabel": change, "log": True, **floor, **by_kind}
     title = "How the action changes without it, or with it exchanged"
     found = [Figure("effects_by_item", "forest", items, title, n.format("bars"), forest)]
     if course["phase"].n_unique() > 1:
-        lines = {"x": "phase", "value": "effect", "color": "item", "log": True, "ylabel": change,
+        lines = {"x": "phase", "value": "effect", "color": "label", "log": True, "ylabel": change,
                  "xlabel": "time (0: first replan, 1: end)", "colors": {"another noise seed": "#7F7F7F"}}  # fmt: skip
         title = "How the action changes without it, over an episode"
         found.append(Figure("effects_over_time", "lines", course, title, n.format("bands"), lines))
-    rows = items.filter(pl.col("item_kind").is_in(["word", "object"])).drop_nulls("lift")
+    rows = items.filter(pl.col("item_kind").is_in(["word", "object"]), kind="without").drop_nulls("lift")
     if rows.height > 1:
-        points = {"x": "lift", "y": "effect", "label": "item", "log": True, **by_kind,
+        points = {"x": "lift", "y": "effect", "label": "label", "log": True, **by_kind,
                   "xlabel": "attention per token, evenly spread = 1", "ylabel": change}  # fmt: skip
         title = "Attention to it, and how the action changes without it"
         found.append(Figure("attention_and_effect", "scatter", rows, title, n.format("bars"), points))
@@ -138,7 +140,7 @@ def figures_of_items(items: pl.DataFrame, course: pl.DataFrame, summary: pl.Data
 def columns_of_items(items: pl.DataFrame) -> list[Column]:
     """The columns of the rows of `by_item` that are shown; those that nothing was recorded of are not."""
     columns = [
-        Column("item", "text", "without, or changed"),
+        Column("label", "text", "without, or changed"),
         Column("total", "number", "nobody reads it", f"how far the action moves then, in {UNIT}"),
         Column("direct", "number", "action tokens do not", "the same, while others may read it"),
         Column("than_noise", "text", "than noise", "whether that is shown to be more than another noise seed does"),

@@ -309,7 +309,7 @@ def test_a_deaf_policy_is_said_first(example_pair):
     assert (finding.numbers["right_first"], finding.numbers["right_other"]) == (6, 2)
     (needs,) = (finding for finding in found.findings if "depend" in finding.asks)
     assert "any word exchanged" in needs.sentence
-    row = one(found["effects"], scope="all", item="any word exchanged")
+    row = one(found["effects"], scope="all", label="any word exchanged")
     assert row["mean_first"] > 1
     assert row["mean_other"] < 1e-4  # to the deaf policy all colours are one word
 

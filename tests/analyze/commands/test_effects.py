@@ -73,7 +73,7 @@ def test_every_replan_has_the_effect_of_the_raw_arrays(store, result):
 
 
 def test_items_have_the_planted_sizes_by_reader(store, result):
-    rows = {row["item"]: row for row in result["effects_items"].iter_rows(named=True)}
+    rows = {row["label"]: row for row in result["effects_items"].iter_rows(named=True)}
     unit = np.sqrt(np.mean((3.0 / spread_of(store)) ** 2))
     of_task = [np.mean([1.0 + 0.05 * ((task + 2 * episode) % 3) for episode in range(4)]) for task in range(3)]
     for name, (_, sizes) in ITEMS.items():
@@ -97,11 +97,11 @@ def test_attention_is_that_of_the_same_replans(store, result):
     image = roles == Role.IMAGE
     mass = (rows * image).sum(axis=1)
     lift = mass / image.sum(axis=1) / ((rows * valid).sum(axis=1) / valid.sum(axis=1))
-    found = result["effects"].filter(item="all pictures", reader="total", task_id=1, episode_index=0)
+    found = result["effects"].filter(label="all pictures", reader="total", task_id=1, episode_index=0)
     np.testing.assert_allclose(found["mass"], mass, rtol=1e-4)
     np.testing.assert_allclose(found["lift"], lift, rtol=1e-4)
     assert (found["norm"] > 0).all()
-    words = result["effects"].filter(item_kind="word")
+    words = result["effects"].filter(item_kind="word", kind="without")
     assert words["lift"].null_count() == 0
     assert words["norm"].null_count() == words.height  # a word is a part of a segment
 
@@ -109,7 +109,7 @@ def test_attention_is_that_of_the_same_replans(store, result):
 def test_the_word_that_matters_is_said_first_and_those_below_the_noise(store, result):
     first = result.findings[0]
     assert re.findall("'([^']*)'", first.sentence)[0] == FIRST
-    shown = result["effects_items"].filter(item_kind="word")
+    shown = result["effects_items"].filter(item_kind="word", kind="without")
     assert shown.filter(than_noise="smaller")["total"].max() is None or (
         shown.filter(than_noise="smaller")["total"].max() < shown["noise"].max()
     )
@@ -137,14 +137,14 @@ def changed(make):
 def gripper_alone(given):
     change = given.change.copy()
     for row, number in zip(change, given.measured, strict=True):
-        if given.conditions[number].name.startswith(f"without_word_{FIRST}"):
+        if (given.items[number].change, given.items[number].name) == ("without", FIRST):
             row[:, :-1] = 0.0
             row[:, -1] *= 9.0
     return replace(given, change=change)
 
 
 def without_the_first_word(given):
-    kept = [i for i, n in enumerate(given.measured) if f"word_{FIRST}" not in given.conditions[n].name]
+    kept = [i for i, n in enumerate(given.measured) if given.items[n].name != FIRST]
     cut = {site: rows[kept] for site, rows in given.cut.items()}
     return replace(given, measured=tuple(given.measured[i] for i in kept), change=given.change[kept], cut=cut)
 
@@ -159,10 +159,10 @@ def unlike(given):
 def test_an_effect_that_is_nearly_all_gripper_is_said(tmp_path):
     spec = replace(FEW, plant_effects=changed(gripper_alone))
     result = effects(question_about(write_store(tmp_path / "a.zarr", spec=spec), intervals="these-tasks"))
-    row = result["effects_items"].filter(item=f"'{FIRST}'").row(0, named=True)
+    row = result["effects_items"].filter(item=FIRST).row(0, named=True)
     assert row["grip_part"] == pytest.approx(1.0)
     assert "100%" in result.findings[0].sentence
-    other = result["effects_items"].filter(item="all pictures").row(0, named=True)
+    other = result["effects_items"].filter(label="all pictures").row(0, named=True)
     squares = (1 / spread_of(tmp_path / "a.zarr")) ** 2
     assert other["grip_part"] == pytest.approx(squares[-1] / squares.sum())
 
@@ -170,7 +170,7 @@ def test_an_effect_that_is_nearly_all_gripper_is_said(tmp_path):
 def test_a_word_that_was_not_tested_is_no_word_without_an_effect(tmp_path):
     spec = replace(FEW, plant_effects=changed(without_the_first_word))
     result = effects(question_about(write_store(tmp_path / "a.zarr", spec=spec), intervals="these-tasks"))
-    row = result["effects_items"].filter(item=f"'{FIRST}'").row(0, named=True)
+    row = result["effects_items"].filter(item=FIRST).row(0, named=True)
     assert (row["than_noise"], row["effect"]) == ("not tested", None)
     assert "1 word" in result.findings[0].limit
 
@@ -233,11 +233,11 @@ def test_a_damaged_episode_is_named_and_can_be_left_out(store, tmp_path, capsys)
 
 
 def test_effects_over_time_are_means_of_its_parts(result):
-    rows = result["effects"].filter(item=f"'{FIRST}'", reader="total", episode_index=0)
-    course = result["effects_time"].filter(item=f"'{FIRST}'")
+    rows = result["effects"].filter(item=FIRST, kind="without", reader="total", episode_index=0)
+    course = result["effects_time"].filter(item=FIRST)
     assert course.height == 10
     assert (course["effect"].diff().drop_nulls() <= 1e-9).all()
-    everything = result["effects"].filter(item=f"'{FIRST}'", reader="total", replan=0)["effect"].mean()
+    everything = result["effects"].filter(item=FIRST, kind="without", reader="total", replan=0)["effect"].mean()
     assert course["effect"][0] == pytest.approx(everything)
     assert rows["begin"].to_list() == [0.0, 0.25, 0.5, 0.75]
 

@@ -15,7 +15,7 @@ from vla_attention.analyze.commands.effects import effects
 from vla_attention.analyze.core.directions import directions, things_of_sentences
 from vla_attention.capture.interventions.condition_name import condition_name
 from vla_attention.capture.store.replan_records import RecordedSteps, ReplanEffects
-from vla_attention.schemas.effects import OtherPrompt
+from vla_attention.schemas.effects import EffectItem, OtherPrompt
 from vla_attention.schemas.interventions import Interventions, NoiseChange
 
 ROWS = (
@@ -47,7 +47,8 @@ def plant(task, episode, replan, tokens):
     change[0] *= noise_of(task, episode)
     named = tuple(structs.replace(one, name=one.name or condition_name(one)) for one in CONDITIONS)
     cut = np.zeros((len(SIZES), tokens.layout.num_keys), np.float32)
-    return ReplanEffects(named, (1.0,) * 7, tuple(range(len(SIZES))), change, {"joint": cut})
+    items = (EffectItem("noise"), *(EffectItem("prompt", row.kind, instead=row.sentence) for row in ROWS))
+    return ReplanEffects(named, items, (1.0,) * 7, tuple(range(len(SIZES))), change, {"joint": cut})
 
 
 def moves(spec, task, episode, steps):

@@ -184,7 +184,7 @@ def test_effects_are_those_of_the_command(server, places):
         for mine, theirs in (("mean", "effect"), ("lift", "lift"), ("noise", "noise")):
             assert (one[mine] is None) == (row[theirs] is None)
             assert one[mine] is None or one[mine] == pytest.approx(row[theirs], rel=1e-6)
-        assert (one["item"], one["reader"]) == (row["item"], row["reader"])
+        assert (one["label"], one["reader"]) == (row["label"], row["reader"])
         of_replans = [value for value in one["effect"] if value is not None]
         assert np.mean(of_replans) == pytest.approx(one["mean"], rel=1e-9)
     episode = open_store(places["effects"]).episodes[0]

@@ -142,7 +142,7 @@ def test_ratio_masses_and_effects_are_those_of_the_analysis(store, recording, st
     words = curves(recording, "effects/word")
     assert len(words) > 1
     for name, values in words.items():
-        assert values == pytest.approx(by_step(effects.filter(item=name), "effect", starts))
+        assert values == pytest.approx(by_step(effects.filter(label=name), "effect", starts))
 
 
 def test_words_have_what_their_keys_get_over_even_attention(store, recording, starts):
@@ -157,7 +157,7 @@ def test_words_have_what_their_keys_get_over_even_attention(store, recording, st
 
 
 def test_a_word_with_a_capital_letter_has_its_effect_and_one_that_comes_twice_a_number():
-    effects = [{"item": "'lift'", "item_kind": "word", "effect": [0.5]}]
+    effects = [{"item": "lift", "kind": "without", "item_kind": "word", "effect": [0.5]}]
     words = [("Lift", 2.0), ("it", 1.0), ("it", 3.0)]
     table, *series = rrd_file._words((), SimpleNamespace(words=[words]), effects, [0])
     assert table.values["text"].splitlines()[2] == "| Lift | 2.00 | 0.50 |"

@@ -116,7 +116,7 @@ def test_groups_are_cut_kept_and_controlled(with_groups, tmp_path):
 
 def test_items_of_groups_have_their_names(with_groups):
     rows = va.open(with_groups).effects()["effects_items"]
-    kinds = dict(rows.select("item", "item_kind").iter_rows())
+    kinds = dict(rows.select("label", "item_kind").iter_rows())
     assert kinds["start"] == "group"
     assert kinds["all pictures"] == "pictures"
 

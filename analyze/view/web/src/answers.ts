@@ -155,6 +155,8 @@ export interface Effect {
   readonly kind: string;
   readonly item: string;
   readonly item_kind: string;
+  /** How sentences call it. */
+  readonly label: string;
   readonly selector: string | null;
   readonly reader: string | null;
   readonly effect: readonly (number | null)[];

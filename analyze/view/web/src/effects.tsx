@@ -6,10 +6,8 @@ import { Hint } from "./hint";
 import { effects, part, ranked, replan, seed, step, taken } from "./state";
 import { shown } from "./sums";
 
-const nameOf = ({ item, item_kind: kind }: Effect): string => (kind === "object" ? item.replaceAll("_", " ") : item);
-
 /** As "without red cube", "'red' as 'blue'". */
-export const described = (effect: Effect): string => `${effect.kind === "without" ? "without " : ""}${nameOf(effect)}`;
+export const described = (effect: Effect): string => `${effect.kind === "without" ? "without " : ""}${effect.label}`;
 
 const FIRST_ROWS = 8;
 const all = signal(false);
@@ -27,8 +25,8 @@ export function EffectTable() {
         <tbody>
           {rows.map((one, i) => all.value || i < FIRST_ROWS || one === taken.value ? (
             <tr key={one.number} class={i < place ? "" : "soft"}>
-              <th>{one === seed.value ? nameOf(one) : <button aria-pressed={taken.value === one} onClick={() => step({ without: taken.value === one ? "" : one.item })}>{nameOf(one)}</button>}</th>
-              <td data-number={`effect-${one.item}`} data-value={one.effect[replan.value]}>{shown(one.effect[replan.value])}</td><td>{shown(one.mean)}</td><td>{one.effect.filter((value) => value !== null).length}</td>
+              <th>{one === seed.value ? one.label : <button aria-pressed={taken.value === one} onClick={() => step({ without: taken.value === one ? "" : one.label })}>{one.label}</button>}</th>
+              <td data-number={`effect-${one.label}`} data-value={one.effect[replan.value]}>{shown(one.effect[replan.value])}</td><td>{shown(one.mean)}</td><td>{one.effect.filter((value) => value !== null).length}</td>
             </tr>
           ) : null)}
         </tbody>

@@ -265,7 +265,7 @@ export const events = computed<readonly EpisodeEvent[]>(() => {
 const tried = computed(() => {
   const found = new Map<string, Effect>();
   for (const reader of [null, "direct", "total"]) {
-    for (const one of effects.value.value?.items ?? []) if (one.reader === reader && ["without", "prompt", "image"].includes(one.kind)) found.set(one.item, one);
+    for (const one of effects.value.value?.items ?? []) if (one.reader === reader && ["without", "prompt", "image"].includes(one.kind)) found.set(one.label, one);
   }
   return found;
 });
@@ -289,15 +289,14 @@ export const ranked = computed(() => {
   return tried.value.size ? known.sort((a, b) => (sizeOf(b) || 0) - (sizeOf(a) || 0)) : [];
 });
 
-export function effectOf(item: string): Effect | null {
-  return tried.value.get(item) ?? tried.value.get(item.toLowerCase()) ?? null;
+/** The effect of a word; effects name words in lower case. */
+export function effectOfWord(text: string): Effect | null {
+  const isIt = (one: Effect): boolean => one.kind === "without" && one.item_kind === "word" && one.item === text.toLowerCase();
+  return [...tried.value.values()].find(isIt) ?? null;
 }
 
-/** How words are called among what is taken away. */
-export const wordItem = (text: string): string => `'${text}'`;
-
 /** What is taken away: the changed actions are drawn beside the executed ones. */
-export const taken = computed<Effect | null>(() => effectOf(part("without")));
+export const taken = computed<Effect | null>(() => tried.value.get(part("without")) ?? null);
 
 /** The link's text of what is picked. */
 export function groupOf(changes: Partial<Picked>): string {

@@ -1,7 +1,7 @@
 /** The instruction as a title: its words shaded by attention or by effect, and what is known of the picked one. */
 import { computed } from "@preact/signals";
 
-import { about, effectOf, effects, groupOf, massesAt, picked, replan, seed, setPart, shade, sizeOf, step, toggled, uniformAt, wordItem, words } from "./state";
+import { about, effectOfWord, effects, groupOf, massesAt, picked, replan, seed, setPart, shade, sizeOf, step, toggled, uniformAt, words } from "./state";
 import { percent, shown, sumOf } from "./sums";
 
 const once = (keys: readonly number[]): [number, number][] => keys.map((key) => [key, 1]);
@@ -21,7 +21,7 @@ interface Shaded {
 
 const shades = computed<readonly Shaded[]>(() => {
   const values = words.value.map(({ text, keys }) => {
-    const effect = effectOf(wordItem(text));
+    const effect = effectOfWord(text);
     return { lift: liftOf(keys, replan.value), effect: sizeOf(effect), noise: sizeOf(seed.value) };
   });
   const of = (one: (typeof values)[0]): number => (shade.value === "attention" ? one.lift : one.effect);
@@ -38,7 +38,7 @@ const shades = computed<readonly Shaded[]>(() => {
 function toggle(place: number): void {
   const chosen = toggled(picked.value.words, place);
   const last = chosen.includes(place) ? place : chosen.at(-1);
-  step({ group: groupOf({ words: chosen }), without: last === undefined ? "" : wordItem(words.value[last]!.text) });
+  step({ group: groupOf({ words: chosen }), without: last === undefined ? "" : (effectOfWord(words.value[last]!.text)?.label ?? "") });
 }
 
 export function Title() {
