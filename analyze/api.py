@@ -211,7 +211,7 @@ class OpenStores:
         "deviation_replans". `by`: keep apart task, family, episode, replan or time.
 
         >>> rows = va.open(with_effects).effects()["effects"]
-        >>> rows.filter(item="all pictures", reader="total").select("task_id", "replan").rows()[:2]
+        >>> rows.filter(label="all pictures", reader="total").select("task_id", "replan").rows()[:2]
         [(0, 0), (0, 1)]
         >>> va.open(replayed).effects()["deviation"].filter(scope="all")["num_episodes"].to_list()
         [6]
