@@ -78,6 +78,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "smooth": {"action": "store_true", "help": "attention changes smoothly between patches"},
     "video": {"choices": ("gif", "mp4"), "help": "also a film of each episode"},
     "fps": {"type": float, "default": 4.0, "metavar": "X", "help": "policy calls a second (default: %(default)s)"},
+    "units": {
+        "action": "append", "default": [], "metavar": "NAME=DIMENSIONS:UNIT",
+        "help": "tell effects by this group of the action's dimensions, as arm=0-5:rad; may be repeated (default: cm "
+        "and degrees of the hand where they are known, else as the policy's own actions are normalised)",
+    },
     "open": {"action": "store_true", "help": "show the page in the browser"},
     "list": {"action": "store_true", "help": "what the stores hold, and what the grouping takes of it"},
 }  # fmt: skip

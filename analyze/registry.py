@@ -42,7 +42,7 @@ _NO_PICTURES = "its keys are no patches of pictures; choose a site with cameras 
 COMMANDS: dict[str, Command] = {
     "analyze": Command(
         "looks or reads? how attention is divided; --by layer, head, time ...",
-        (*_ROWS, *_GROUPING, "by", "without_sinks", "list", "save_viz"),
+        (*_ROWS, *_GROUPING, "by", "without_sinks", "units", "list", "save_viz"),
         examples=(
             "analyze runs/libero_10.zarr",
             "analyze runs/libero_10.zarr --by layer,head",
@@ -52,7 +52,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "language": Command(
         "does it listen: what it was told and did, which words decide, and which are read",
-        _ROWS,
+        (*_ROWS, "units"),
         ("text",),
         _NO_WORDS,
         ("language runs/cubes.zarr", "language runs/cubes.zarr --task 'touch the red cube' 'touch the blue cube'"),
@@ -80,12 +80,12 @@ COMMANDS: dict[str, Command] = {
     ),
     "effects": Command(
         "what the action depends on: without a word, a picture, an object; or a data set's actions",
-        (*_ROWS, "by"),
+        (*_ROWS, "by", "units"),
         examples=("effects runs/cubes.zarr", "effects runs/cubes.zarr --by task", "effects runs/droid.zarr"),
     ),
     "compare": Command(
         "what changed between runs: success, what was done, actions of reruns, attention",
-        (*_ROWS, *_GROUPING, "allow_mismatch"),
+        (*_ROWS, *_GROUPING, "allow_mismatch", "units"),
         examples=(
             "compare runs/base.zarr runs/tuned.zarr",
             "compare base=runs/a.zarr,runs/b.zarr tuned=runs/c.zarr,runs/d.zarr",
@@ -108,7 +108,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "report": Command(
         "all of it in one HTML file",
-        (*_ROWS, *_GROUPING, "num_episodes", "num_replans", "open"),
+        (*_ROWS, *_GROUPING, "units", "num_episodes", "num_replans", "open"),
         examples=("report runs/libero_10.zarr --open", "report runs/libero_10.zarr --output paper/report.html"),
         page=True,
     ),

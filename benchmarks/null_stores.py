@@ -10,7 +10,7 @@ In a null store every key's attention is the same in expectation; tasks, episode
     objects   attention does not depend on where the objects are
     compare   two runs of the same distribution, paired by initial state
     language  what is done has nothing to do with what is told (rollouts without attention: seconds)
-    effects   the action changes as much without each word as with another noise seed (tables: seconds)
+    effects   the action changes as much without each word, part and picture as with another noise seed
 
 A planted store differs in one place: the attention to the pictures, to the word "the", to the first object, or of the
 second run, is higher, by `FACTOR` or a power of it.
@@ -22,25 +22,22 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import vla_attention as va
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
+from tests.kit.planted_effects import FIRST, planted_effects
 from tests.kit.stores import StoreSpec, write_store
-from vla_attention.analyze.commands.effects.answer import deciding
-from vla_attention.analyze.commands.effects.items import by_item
 from vla_attention.analyze.commands.language import SHOWN_AT, listens
-from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.core.behaviour import with_choices
-from vla_attention.analyze.core.recorded_effects import summary_of
-from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 
@@ -151,36 +148,43 @@ def says_it_listens(sets: int, planted: bool) -> float:
     return said / sets
 
 
-def names_a_word(sets: int, planted: float) -> float:
-    """The share of sets of recorded effects of which `effects` says that a word is shown to exceed another noise seed.
+#: What `effects` may name: the question of a finding -> the numbers that are counts of named items.
+EFFECT_SENTENCES = {
+    "Does it tell words apart?": (),
+    "What if a word is left out?": ("shown",),
+    "And without something else?": ("shown", "gripper", "smaller"),
+    "How do these words reach the action?": (),
+    "Does attention tell?": (),
+}
 
-    In a null set all words and another noise seed change the action by as much on average; tasks scatter, each word
-    scatters by tasks, and episodes scatter. In a planted set the first word changes it by `planted` more.
+
+def named_by_effects(number: int, planted: float, folder: Path, tasks: int = 6, episodes: int = 3) -> set[str]:
+    """The findings of `effects` that name something in a store whose actions change as much without each word, part and
+    picture, and with each word exchanged, as with another noise seed.
+
+    Tasks and episodes scatter, each item scatters by tasks, and replans scatter. In a planted store the first word
+    changes the action by `planted` times as much more.
     """
-    return sum(_shown_words(np.random.default_rng(number), planted) > 0 for number in range(sets)) / sets
+    generator = np.random.default_rng(number)
+    scene, of_item = generator.normal(0, 0.2, (tasks, episodes)), dict[str, Rows]()
 
+    def scale(name: str, task: int, episode: int, replan: int) -> float:
+        del replan
+        own = of_item.setdefault(name, generator.normal(0, 0.15, tasks))
+        size = float(np.exp(scene[task, episode] + own[task] + generator.normal(0, 0.2)))
+        return size * (1 + planted * (FIRST in name))
 
-def _shown_words(generator: np.random.Generator, planted: float, tasks: int = 6, episodes: int = 3) -> int:
-    scene, rows = generator.normal(0, 0.2, (tasks, episodes)), []
-    for number in range(9):  # the last is another noise seed
-        of_task, name = generator.normal(0, 0.15, tasks), f"'{number}'" if number < 8 else "noise"
-        for task in range(tasks):
-            for episode in range(episodes):
-                effect = np.exp(scene[task, episode] + of_task[task] + generator.normal(0, 0.2)) - 0.5
-                rows.append((task, episode, name, effect + planted * (number == 0)))
-    frame = pl.DataFrame(rows, schema=["task_id", "episode_index", "item", "effect"], orient="row")
-    is_word, place = pl.col("item") != "noise", ["task_id", "episode_index"]
-    noise = frame.filter(~is_word).select(*place, noise="effect")
-    frame = frame.filter(is_word).join(noise, on=place).with_columns(
-        pl.lit("s").alias("suite"), pl.lit("without").alias("kind"), pl.lit("word").alias("item_kind"),
-        pl.lit("total").alias("reader"), pl.lit("").alias("selector"), pl.col("item").alias("condition"),
-        pl.col("item").alias("label"), pl.lit("").alias("instead"),
-        minus_noise=pl.col("effect") - pl.col("noise"), times_noise=(pl.col("effect") / pl.col("noise")).log(),
-        square=pl.col("effect") ** 2, gripper_square=pl.lit(0.0),
-        **dict.fromkeys(("effect_chunk", "angle", "gripper_flips", "keys", "mass", "lift", "norm"), pl.lit(1.0)),
-    )  # fmt: skip
-    words = by_item(summary_of(frame, Sampling()))
-    return int(deciding(words, ActionSpread(np.ones(7), np.ones(7, bool))).numbers["shown"] or 0)
+    plant = planted_effects(scale, alike=0.3, exchanged=True)
+    spec = StoreSpec(tasks=tuple(range(tasks)), episodes=episodes, replans=2, layers=(0,), heads=(0,), frames=False,
+                     coverage=False, plant_effects=plant, seed=number)  # fmt: skip
+    found = va.open(write_store(folder / "a.zarr", spec=spec)).effects()
+    named = set()
+    for finding in found.findings:
+        counts = EFFECT_SENTENCES.get(finding.asks)
+        by_count = counts and any(int(finding.numbers[name]) for name in counts)
+        if by_count or (counts == () and not (finding.asks == "Does it tell words apart?" and finding.limit)):
+            named.add(finding.asks)
+    return named
 
 
 def main() -> None:
@@ -199,8 +203,13 @@ def main() -> None:
             print(f"  {kind:8} says that it listens in {share:.1%}", flush=True)
             continue
         if kind == "effects":
-            share = names_a_word(arguments.stores, 0.8 * arguments.planted)
-            print(f"  {kind:8} names a word in {share:.1%}", flush=True)
+            every = []
+            for number in range(arguments.stores):
+                with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()):
+                    every.append(named_by_effects(number, 0.8 * arguments.planted, Path(folder)))
+            print(f"  {kind:8} names something in {sum(map(bool, every)) / len(every):.1%}", flush=True)
+            for asks in EFFECT_SENTENCES:
+                print(f"           {asks:40} {sum(asks in named for named in every) / len(every):.1%}", flush=True)
             continue
         named = 0
         for number in range(arguments.stores):

@@ -10,6 +10,7 @@ import polars as pl
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, perturbed, tables_of
 from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
+from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import (
     PAIR,
@@ -109,27 +110,31 @@ def _pairing(part: Compared, any_seed: bool) -> str:
 
 
 def _how_far(first: Run, reruns: Sequence[Run], sampling: Sampling) -> tuple[list[Finding], list[Table]]:
-    """How far the actions of reruns are from the base's, in units of their spread, beside another noise seed."""
+    """How far the actions of reruns are from the base's, beside another noise seed."""
     if not reruns:
         return [], []
-    episodes = moved_episodes(first, reruns)
-    table, findings = moved(episodes, sampling), []
+    episodes, units = moved_episodes(first, reruns)
+    table, findings = moved(episodes, units, sampling), []
     for run, row in zip(reruns, table.iter_rows(named=True), strict=True):
-        said = f"{run.name}: by {with_interval(row, 'effect')} standard deviations of the actions of {first.name}"
+        said = f"{run.name}: {units.said(with_interval(row, 'effect'))} than in {first.name}"
         limit, times = "", row["over_noise"]
         if is_noise(run):
-            said += ", which is how far another noise seed alone moves them"
+            said += ", by another noise seed alone"
         elif times is None:
             limit = "How much of it is chance, a rerun with another noise seed says (--noise-seed)."
         elif times < 1:
             said += f"; that is smaller than what another noise seed does ({with_interval(row, 'noise')})"
         else:
             shown = "" if (row["minus_noise_q"] or 1.0) <= NAMED_AT else ", which is not shown to be more"
-            said += f"; another noise seed moves them by {with_interval(row, 'noise')}{shown}"
-        if (row["gripper_flips"] or 0.0) >= 0.5:
-            said += f". The gripper is told the opposite in {row['gripper_flips']:.0%} of the steps"
+            said += f"; another noise seed: {with_interval(row, 'noise')}{shown}"
+        for part in units.parts[1:]:
+            size = f"{row[part.name]:.0%}" if part.how == "opposite" else f"{row[part.name]:.2g}"
+            said += f"; {part.said.format(size)}"
         findings.append(Finding(f"{said}.", _MOVED, {**row}, limit))
-    return findings, [Table("moved", table, _MOVES, "How far the actions move"), Table("moved_episodes", episodes)]
+    return findings, [
+        Table("moved", table, _moves(units), "How far the actions move"),
+        Table("moved_episodes", episodes),
+    ]
 
 
 def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame) -> list[Finding]:
@@ -182,13 +187,14 @@ def _needs(part: Compared) -> list[Finding]:
     if "effects" not in part.rows:
         return []
     rows = part.rows["effects"].filter(ALL, reader="total")
-    said = [
-        f"{2.0 ** row['mean_other']:.2g} standard deviations {'without' if row['kind'] == 'without' else 'with'} "
-        f"{row['label']} (against {2.0 ** row['mean_first']:.2g})"
-        for row in _largest(rows).iter_rows(named=True)
-    ]
+    assert part.units is not None
+    said = []
+    for row in _largest(rows).iter_rows(named=True):
+        moved_by = part.units.said(f"{2.0 ** row['mean_other']:.2g}")
+        without = "without" if row["kind"] == "without" else "with"
+        said.append(f"{without} {row['label']} {moved_by} (against {2.0 ** row['mean_first']:.2g})")
     numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}
-    text = f"the action moves by {', '.join(said)}" if said else "no item's effect is shown to differ"
+    text = "; ".join(said) if said else "no item's effect is shown to differ"
     limit = "Trust exchanged words more than missing ones: a sentence with a missing word is new to the policy."
     return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers, limit)]
 
@@ -232,15 +238,17 @@ def _overall(part: Compared) -> pl.DataFrame:
     return average if average.height else rows
 
 
-_MOVES = [
-    Column("run", "text"),
-    Column("effect", "number", "moved by", "standard deviations of the first run's actions, over the executed steps"),
-    Column("noise", "number", "another noise"),
-    Column("over_noise", "factor", "times noise"),
-    Column("angle", "number", "turn", "of the direction of the hand's movement, degrees"),
-    Column("gripper_flips", "percent", "gripper", "steps in which it is told the opposite"),
-    Column("num_episodes", "count", "episodes"),
-]
+def _moves(units: ActionUnits) -> list[Column]:
+    return [
+        Column("run", "text"),
+        Column("effect", "number", units.title, units.said("so much")),
+        Column("noise", "number", "another noise"),
+        Column("over_noise", "factor", "times noise"),
+        *units.further_columns,
+        Column("num_episodes", "count", "episodes"),
+    ]
+
+
 _RUNS = [
     Column("run", "text"),
     Column("num_episodes", "count", "episodes"),

@@ -151,7 +151,7 @@ _EACH = (
     (
         "effects",
         [Column("label", "text", "without, or changed")],
-        "How far the action moves, in standard deviations",
+        "How far the action moves",
     ),
     ("objects", [Column("item", "text", "object")], "Attention to objects, over that of their area"),
     ("words", [_WORD], "Attention to words, evenly spread = 1"),

@@ -10,13 +10,13 @@ A table of values has one row per (episode, item): `EPISODE_ID`, the columns of 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.core.action_changes import units_of_recorded
+from vla_attention.analyze.core.action_changes import ActionUnits, units_of
 from vla_attention.analyze.core.courses import strip
 from vla_attention.analyze.core.estimate import Scale, estimate, with_q
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
@@ -96,6 +96,7 @@ class Compared:
         pairs: of their episodes, see `pairs_of`; without any, means of independent episodes are compared.
         rows: by kind, see `differences`.
         values: by kind, both values of every pair.
+        units: of recorded effects; None where one of the runs has none.
     """
 
     first: RunValues
@@ -103,6 +104,7 @@ class Compared:
     pairs: pl.DataFrame
     rows: Mapping[str, pl.DataFrame]
     values: Mapping[str, pl.DataFrame]
+    units: ActionUnits | None = None
 
     @property
     def name(self) -> str:
@@ -141,8 +143,10 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
             {**side, "groups": groups.filter(pl.col("quantity") != "success")}
             for side, groups in zip(sides, of_groups, strict=True)
         ]
+    units = None
     if (effects := _effects(first.run, other.run)) is not None:
-        for side, of_side in zip(sides, effects, strict=True):
+        of_sides, units = effects
+        for side, of_side in zip(sides, of_sides, strict=True):
             side["effects"] = of_side
     rows, values = {}, {}
     for kind, (item, looks) in KINDS.items():
@@ -154,24 +158,18 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
             rows[kind] = differences(values[kind], item, sampling, looks)
         else:
             rows[kind] = differences_unpaired(of_kind, (first.episodes, other.episodes), item, sampling, looks)
-    return Compared(first, other, pairs, rows, values)
+    return Compared(first, other, pairs, rows, values, units)
 
 
-def _effects(first: Run, other: Run) -> tuple[pl.DataFrame, pl.DataFrame] | None:
-    """log2 of the recorded effects of both runs on their actions; None where one recorded none.
-
-    Each is in units of its own run's actions, over the dimensions that both compare.
-    """
+def _effects(first: Run, other: Run) -> tuple[list[pl.DataFrame], ActionUnits] | None:
+    """log2 of the recorded effects of both runs on their actions, in units of both; None where one recorded none."""
     if not all(store.attributes.recording.effects is not None for run in (first, other) for store in run.stores):
         return None
     questions = [run.question for run in (first, other)]
     try:
-        units = [units_of_recorded(*one.stores, skip_corrupt=one.settings.skip_corrupt) for one in questions]
-        used = units[0].used & units[1].used
-        found = [
-            recorded_effects(one, attention=False, spread=replace(unit, used=used))
-            for one, unit in zip(questions, units, strict=True)
-        ]
+        settings = questions[0].settings
+        units = units_of([*first.stores, *other.stores], settings.units, settings.skip_corrupt)
+        found = [recorded_effects(one, attention=False, units=units) for one in questions]
     except BadArgument:  # the question `effects` says why none is shown
         return None
     tables = []
@@ -186,7 +184,7 @@ def _effects(first: Run, other: Run) -> tuple[pl.DataFrame, pl.DataFrame] | None
         exchanged = exchanged.with_columns(**{name: pl.lit(any_word.get(name, "")) for name in (*ITEM, "reader")})
         rows = pl.concat([exchanged, rows.filter(pl.col("reader").is_in(["total", "direct"]))], how="diagonal")
         tables.append(rows.select(*EPISODE_ID, *ITEM, "reader", value=pl.col("effect").log(2.0)))
-    return tables[0], tables[1]
+    return tables, units
 
 
 def strip_of_pair(
@@ -341,7 +339,7 @@ def differences_unpaired(
             )
         bounds = dict.fromkeys(("difference_low", "difference_high", "difference_p"), pl.Float64)
         frame = pl.DataFrame(rows, infer_schema_length=None, schema_overrides=bounds) if rows else pl.DataFrame()
-        return with_q(frame, "difference", of).with_columns(paired=pl.lit(False)) if rows else frame
+        return with_q(frame, ["difference"], of).with_columns(paired=pl.lit(False)) if rows else frame
 
     return _by_scope(both, item, looks, rows_of)
 

@@ -17,7 +17,7 @@ from vla_attention.analyze.core.action_changes import TRANSLATION, BaseEpisode, 
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.effects import CHANGE
-from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
+from vla_attention.schemas.episode_steps import HAND, POSES
 from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, parse_episode_name
@@ -48,18 +48,18 @@ def _of_interest(attributes: EpisodeAttributes) -> frozenset[str]:
     return frozenset(thing.name for thing in attributes.objects if thing.of_interest)
 
 
-def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataFrame, int]:
+def directions(items: Sequence[SelectedEpisode], names: Names, metres: float) -> tuple[pl.DataFrame, int]:
     """How much closer to the newly named thing the executed steps of a chunk go, as the policy was told and otherwise.
 
     The steps' translations are summed, projected on the line from the hand to the thing at the chunk's beginning, and
-    brought to metres by how far the hand moved for all executed chunks: sum(moved . told) / sum(told . told).
+    brought to metres. metres: how far a command of 1 moves the hand in a step.
 
     Returns:
         One row per episode and sentence that names a single other thing: suite, task_id, episode_index, sentence (its
         kind), and in metres changed, unchanged, closer (their difference), means over replans; and of how many
         sentences of `KINDS` that is not known.
     """
-    rows, moved, left_out = [], np.zeros(2), set()
+    rows, left_out = [], set()
     for item in (one.fresh() for one in items if one.episode.has(CHANGE) and one.episode.has(POSES)):
         attributes, base = item.episode.attributes, BaseEpisode.of(item)
         steps, effects = attributes.steps, attributes.effects
@@ -67,7 +67,6 @@ def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataF
         assert effects is not None
         poses = item.episode.read(POSES).astype(np.float64)[..., :3]
         hand = poses[:, steps.bodies.index(HAND)]
-        moved += _moved(hand, item.episode.read(EXECUTED).astype(np.float64), base)
         change = item.episode.read(CHANGE).astype(np.float64) * np.array(effects.units)
         for number, prompt in enumerate(condition.prompt for condition in effects.conditions):
             entries = np.flatnonzero(np.array(effects.condition) == number)
@@ -86,10 +85,8 @@ def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataF
             rows.append(
                 (item.store.suite, attributes.task_id, attributes.episode_index, prompt.meaning, changed, unchanged)
             )
-    if moved.min() <= 0:
-        return pl.DataFrame(), len(left_out)
     table = pl.DataFrame(rows, schema=[*EPISODE_ID, "sentence", "changed", "unchanged"], orient="row")
-    table = table.with_columns(pl.col("changed", "unchanged") * (moved[0] / moved[1]))
+    table = table.with_columns(pl.col("changed", "unchanged") * metres)
     return table.with_columns(closer=pl.col("changed") - pl.col("unchanged")), len(left_out)
 
 
@@ -101,10 +98,3 @@ def along(line: Array, actions: Array, steps: NDArray[np.int64]) -> Array:
     told = (actions[..., TRANSLATION] * counted(steps, actions.shape[1])[..., None]).sum(axis=1)
     result: Array = (told * line).sum(axis=1) / np.linalg.norm(line, axis=1)
     return result
-
-
-def _moved(hand: Array, executed: Array, base: BaseEpisode) -> Array:
-    """Of an episode sum(moved . told) and sum(told . told) over its replans; hand: (moment, 3), executed: by step."""
-    edges = np.append(base.starts, base.num_steps)
-    told = np.add.reduceat(executed[:, TRANSLATION], base.starts, axis=0)
-    return np.array([(np.diff(hand[edges], axis=0) * told).sum(), (told**2).sum()])

@@ -37,6 +37,7 @@ def estimate(
     nulls: Mapping[str, float] | None = None,
     family: Collection[str] = (),
     quotients: Mapping[str, tuple[str, str]] | None = None,
+    together: Collection[str] = (),
 ) -> pl.DataFrame:
     """Mean of each value for every item of `by`, over tasks of the tasks' means, with its interval (see `intervals`).
 
@@ -51,6 +52,7 @@ def estimate(
         nulls: for some values or quotients, what they would be if nothing were there.
         family: of `by`, the columns inside of whose values the looks are counted; all rows are one look's unless given.
         quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
+        together: of `nulls`, those of which an item is named by any: their looks are counted together.
 
     Returns:
         One row per item in order of first appearance: `by`, num_episodes, num_tasks, num_families, intervals; per value
@@ -98,8 +100,9 @@ def estimate(
         schema |= dict.fromkeys(ends, pl.Float64)
     rows = pl.concat([items.drop("_row"), pl.DataFrame(found, schema=schema)], how="horizontal")
     for name in nulls:
-        rows = with_q(rows, name, family)
-    return rows
+        if name not in together:
+            rows = with_q(rows, [name], family)
+    return with_q(rows, [*together], family) if together else rows
 
 
 def _of_what_is_left(statistic: EpisodeStatistic, place: int, given: Units, one: Estimate) -> Estimate:
@@ -115,13 +118,13 @@ def _of_what_is_left(statistic: EpisodeStatistic, place: int, given: Units, one:
     return estimates([part], left.decided())[0]
 
 
-def with_q(table: pl.DataFrame, name: str, family: Collection[str] = ()) -> pl.DataFrame:
-    """The table with NAME_q in the place of NAME_p, adjusted for the number of rows, or of rows of each `family`."""
+def with_q(table: pl.DataFrame, names: Sequence[str], family: Collection[str] = ()) -> pl.DataFrame:
+    """The table with NAME_q in the place of NAME_p, adjusted for the looks of all names in all rows, or by `family`."""
     parts = table.partition_by(*family, maintain_order=True) if family else [table]
-    adjusted = [
-        part.with_columns(
-            pl.Series(f"{name}_q", adjusted_p_values(part[f"{name}_p"].to_list()), dtype=pl.Float64)
-        ).drop(f"{name}_p")
-        for part in parts
-    ]
-    return pl.concat(adjusted) if adjusted else table.rename({f"{name}_p": f"{name}_q"})
+    adjusted = []
+    for part in parts:
+        p_values = [p for name in names for p in part[f"{name}_p"].to_list()]
+        by_name = np.array(adjusted_p_values(p_values), dtype=object).reshape(len(names), part.height)
+        q_values = [pl.Series(f"{name}_q", list(of), pl.Float64) for name, of in zip(names, by_name, strict=True)]
+        adjusted.append(part.with_columns(q_values).drop(f"{name}_p" for name in names))
+    return pl.concat(adjusted) if adjusted else table.rename({f"{name}_p": f"{name}_q" for name in names})

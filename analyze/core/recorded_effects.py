@@ -17,13 +17,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import (
-    CHANGES,
-    GRIPPER,
-    ActionSpread,
+    EFFECT,
+    ActionUnits,
     BaseEpisode,
-    changes_of,
-    root_mean_square_change,
-    units_of_recorded,
+    first_angle,
+    units_of,
 )
 from vla_attention.analyze.core.axes import weighted, with_families
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
@@ -44,10 +42,13 @@ from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.safe_text import visible
 
-#: Change of an unchanged call among those made together that float32 explains, in spreads; bfloat16 leaves .02 to .05.
+#: Smaller changes are rounding, in any unit: in float32 unchanged calls among those made together stay below it, in
+#: bfloat16 they reach .02 to .05.
 _MOST_ROUNDING = 1e-3
 #: Parts of an episode's time.
 TIME_PARTS = 10
+#: The part of the gripper.
+GRIPPER = "gripper"
 #: Parts of the prompt, other sentences and pictures -> what they are called.
 _PARTS = {"bos": "first token", "template": "fixed words of the prompt", "instruction": "whole instruction",
           "state": "state digits"}  # fmt: skip
@@ -62,11 +63,11 @@ NAMES = ("condition", "kind", "item", "item_kind", "instead", "label", "selector
 #: Of these, what tells items apart, whoever does not read them.
 ITEM = ("kind", "item_kind", "item", "instead", "label")
 _ATTENTION = ("keys", "mass", "lift", "norm")
+#: Beside the parts: of the first one over whole chunks, and the angle between the first actions' translations.
+_CHUNK, _ANGLE = "effect_chunk", "angle"
 _VALUES: dict[str, Scale] = {
-    **dict.fromkeys(("effect", "effect_chunk", "angle", *_ATTENTION, "noise"), "positive"),
-    "gripper_flips": "share",
-    "minus_noise": "plain",
-    "times_noise": "plain",
+    **dict.fromkeys((_CHUNK, _ANGLE, *_ATTENTION, "noise"), "positive"),
+    **dict.fromkeys(("minus_noise", "times_noise", "gripper_minus_noise"), "plain"),
 }
 
 
@@ -79,13 +80,13 @@ class RecordedEffects:
 
     Attributes:
         question: stores and selection.
-        spread: the units.
+        units: what changes are measured by.
         measured: of each episode itself, its arrays by entry, and its attention to the items, site by site.
         notes: how far unchanged calls are from those that the robot executed; items that are read at another site.
     """
 
     question: Question
-    spread: ActionSpread
+    units: ActionUnits
     measured: Sequence[_Episode]
     notes: tuple[str, ...]
 
@@ -94,82 +95,95 @@ class RecordedEffects:
 
         Returns:
             suite, task_id, instruction, episode_index, replan, env_step; begin, end (the part of the episode's time in
-            which the call's actions were executed, 0 to 1); `NAMES`; `action_changes.CHANGES`; gripper_effect (the
-            effect if the gripper alone had changed); and keys, mass, lift and norm of the item in the same replan
-            (norm: of its contribution to the residual stream).
+            which the call's actions were executed, 0 to 1); `NAMES`; the parts of `units`, the first as `effect`;
+            effect_chunk, that over the whole chunk; angle in degrees between the first actions' translations; and
+            keys, mass, lift and norm of the item in the same replan (norm: of its contribution to the residual stream).
         """
-        return frame_of_episodes(self.measured, _rows)
+        return frame_of_episodes(self.measured, partial(_rows, parts=self.units.names))
 
     def episodes(self, by: Collection[str] = ()) -> pl.DataFrame:
         """Means over the replans of every episode, condition and cell of the axes `by` (replan, time, ...).
 
         Returns:
-            suite, task_id, instruction, episode_index, family, the axes' columns, `NAMES`, num_replans; `CHANGES`,
-            keys, mass, lift, norm; noise: the effect of another noise seed there, minus_noise: the effect minus it, and
-            times_noise: the logarithm of their quotient.
+            suite, task_id, instruction, episode_index, family, the axes' columns, `NAMES`, num_replans; the values of
+            `rows`; noise: the effect of another noise seed there, minus_noise: the effect minus it, times_noise: the
+            logarithm of their quotient; gripper_minus_noise, where the gripper is known.
         """
         cells = [name for axis, name in (("replan", "replan"), ("replan", "env_step"), ("time", "phase")) if axis in by]
-        then = partial(_means, cells=cells)
-        rows = frame_of_episodes(self.measured, _rows, then).collect()
+        then = partial(_means, cells=cells, values=(*self.units.names, _CHUNK, _ANGLE, *_ATTENTION))
+        rows = frame_of_episodes(self.measured, partial(_rows, parts=self.units.names), then).collect()
         place = [*EPISODE_ID, *cells]
-        noise = rows.filter(kind="noise").group_by(place).agg(noise=pl.col("effect").mean())
+        known = [name for name in (EFFECT, GRIPPER) if name in rows.columns]
+        noise = rows.filter(kind="noise").group_by(place).agg(pl.col(name).mean().alias(f"_{name}") for name in known)
         rows = rows.join(noise, on=place, how="left", maintain_order="left")
-        rows = rows.with_columns(noise=pl.when(pl.col("kind") != "noise").then("noise"))
-        quotient = (pl.col("effect") / pl.col("noise")).log()
-        rows = rows.with_columns(minus_noise=pl.col("effect") - pl.col("noise"), times_noise=quotient)
-        return with_families(rows, self.question.sampling)
+        apart, quotient = pl.col("kind") != "noise", times(EFFECT, f"_{EFFECT}")
+        minus = {"minus_noise": EFFECT} | ({"gripper_minus_noise": GRIPPER} if GRIPPER in known else {})
+        rows = rows.with_columns(
+            pl.when(apart).then(f"_{EFFECT}").alias("noise"),
+            pl.when(apart).then(quotient).alias("times_noise"),
+            *(pl.when(apart).then(pl.col(of) - pl.col(f"_{of}")).alias(name) for name, of in minus.items()),
+        )
+        return with_families(rows.drop(f"_{name}" for name in known), self.question.sampling)
 
 
-def summary_of(episodes: pl.DataFrame, sampling: Sampling, looks: Sequence[str] = ()) -> pl.DataFrame:
+def times(effect: str, noise: str) -> pl.Expr:
+    """The logarithm of an effect over another one; what is below rounding counts as rounding, so that it is finite."""
+    above, below = (pl.col(name).clip(lower_bound=_MOST_ROUNDING) for name in (effect, noise))
+    return (above / below).log()
+
+
+def summary_of(
+    episodes: pl.DataFrame, units: ActionUnits, sampling: Sampling, looks: Sequence[str] = ()
+) -> pl.DataFrame:
     """Means over episodes with intervals, see `estimate`: the largest effects first.
 
     Args:
         episodes: as `RecordedEffects.episodes` gives them.
+        units: of the effects.
         sampling: what intervals are about.
         looks: columns that tell cells apart.
 
     Returns:
         looks, `NAMES`, num_episodes, num_tasks; the values of `episodes`; over_noise, the mean effect / that of another
-        noise seed; gripper_part, the part of the squared effect that is the gripper's. minus_noise_q and times_noise_q
-        are adjusted for the conditions of a cell, without those of random keys.
+        noise seed. times_noise_q (of no difference from another noise seed), gripper_minus_noise_q and lift_q are
+        adjusted for the conditions of a cell with the same reader, without those of random keys.
     """
-    is_random = pl.col("kind") == "random"
+    # What is named is one row an item: of its total effect, or where that was not tried of the direct one.
+    reader = pl.col("reader").fill_null("total")
+    look = pl.when(pl.col("kind") == "random").then(pl.lit("random")).otherwise(reader)
+    values = {name: scale for name, scale in (units.scales | _VALUES).items() if name in episodes.columns}
+    # By the effect or by the gripper an item is named.
+    nulls = {"lift": 1.0} | {name: 0.0 for name in ("times_noise", "gripper_minus_noise") if name in values}
     found = estimate(
-        episodes.with_columns(_random=is_random), [*looks, *NAMES, "_random"], _VALUES, sampling,
-        {"minus_noise": 0.0, "times_noise": 0.0},
-        [*looks, "_random"], {"over_noise": ("effect", "noise")},
+        episodes.with_columns(_look=look), [*looks, *NAMES, "_look"], values, sampling, nulls, [*looks, "_look"],
+        {"over_noise": (EFFECT, "noise")}, [name for name in nulls if name != "lift"],
     )  # fmt: skip
-    squares = episodes.group_by(*looks, *NAMES).agg(
-        gripper_part=pl.col("gripper_square").mean() / pl.col("square").mean()
-    )
-    found = found.join(squares, on=[*looks, *NAMES], how="left", nulls_equal=True, maintain_order="left")
-    found = found.with_columns(
-        pl.when(~is_random).then(name).alias(name) for name in ("minus_noise_q", "times_noise_q")
-    ).drop("_random")
+    known = pl.col("_look") != "random"
+    found = found.with_columns(pl.when(known).then(f"{name}_q").alias(f"{name}_q") for name in nulls).drop("_look")
     order = [*looks, "effect", "condition"]
     return found.sort(order, descending=[name == "effect" for name in order], nulls_last=True)
 
 
 def recorded_effects(
-    question: Question, attention: bool = True, spread: ActionSpread | None = None
+    question: Question, attention: bool = True, units: ActionUnits | None = None
 ) -> RecordedEffects | None:
     """The effects that a question's stores recorded; None where they recorded none.
 
-    attention: whether the items' attention is measured too. spread: other units than the stores' own.
+    attention: whether the items' attention is measured too. units: others than the stores' own.
 
     Raises:
-        BadArgument: none that they recorded can be shown; see `units_of_recorded`.
+        BadArgument: none that they recorded can be shown; see `units_of`.
     """
     having = [item for item in question.selected if item.episode.attributes.effects is not None]
     if not having:
         if all(store.attributes.recording.effects is None for store in question.stores):
             return None
         raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, "None was measured in a selected episode."))
-    if spread is None:
-        spread = units_of_recorded(*question.stores, skip_corrupt=question.settings.skip_corrupt)
+    if units is None:
+        units = units_of(question.stores, question.settings.units, question.settings.skip_corrupt)
     places = _places(replace(question, selected=tuple(having))) if attention else []
     measured = [measure(at, partial(_items, selectors=selectors), "effects") for at, selectors in places]
-    each = partial(_arrays, spread=spread, places=[(at.site, at.selection, selectors) for at, selectors in places])
+    each = partial(_arrays, units=units, places=[(at.site, at.selection, selectors) for at, selectors in places])
 
     def made(i: int, arrays: Mapping[str, Any]) -> _Episode:
         return having[i], arrays, [at_site[i] for at_site in measured]
@@ -178,13 +192,13 @@ def recorded_effects(
         [item.fresh() for item in items] for items in zip(having, *(at.selected for at, _ in places), strict=True)
     )
     episodes = OnDisk(each_episode(each, together), made)
-    drift = _drift(episodes)
+    drift = _drift(episodes, units)
     elsewhere = [
         f"Attention to {plural(len(selectors), 'item')} is of site '{at.site}', where the keys are."
         for at, selectors in places
         if at.site != question.site
     ]
-    found = RecordedEffects(question, spread, episodes, (*drift, *elsewhere))
+    found = RecordedEffects(question, units, episodes, (*units.notes, *drift, *elsewhere))
     if found.rows().head(1).collect().is_empty():
         said = drift or ("None was measured in a selected replan.",)
         raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, " ".join(said)))
@@ -281,9 +295,9 @@ def _items(item: SelectedEpisode, selectors: Sequence[str]) -> Items:
 
 
 def _arrays(
-    items: Sequence[SelectedEpisode], spread: ActionSpread, places: Sequence[tuple[str, Selection, Sequence[str]]]
+    items: Sequence[SelectedEpisode], units: ActionUnits, places: Sequence[tuple[str, Selection, Sequence[str]]]
 ) -> dict[str, Any]:
-    """By entry replan, condition, begin, end, changes (entry, change), gripper; norms (replan, selector) by place.
+    """By entry replan, condition, begin, end, changes (entry, part), chunk, angle; norms (replan, selector) by place.
 
     items: the episode, then with the tokens of each place's site.
     """
@@ -294,11 +308,8 @@ def _arrays(
     at, change = base.at(replan), np.zeros((0, *base.actions.shape[1:]))
     if item.episode.has(CHANGE):
         change = item.episode.read(CHANGE).astype(np.float64) * np.array(effects.units)
-    number, gripper = len(spread.used), np.full(len(replan), np.nan)
-    of_gripper = replace(spread, used=spread.used & (np.arange(number) == number + GRIPPER))
-    if of_gripper.used.any() and not item.store.attributes.protocol.of_other_loop:
-        alone = root_mean_square_change(at.actions, at.actions + change, of_gripper, at.executed)
-        gripper = alone / np.sqrt(spread.used.sum())
+    # Which numbers move the hand is known of our suites only.
+    known = not item.store.attributes.protocol.of_other_loop
     edges = np.append(base.starts, base.num_steps) / base.num_steps
     return {
         "replan": replan,
@@ -306,8 +317,9 @@ def _arrays(
         "env_step": base.env_step[replan],
         "begin": edges[:-1][replan],
         "end": edges[1:][replan],
-        "changes": changes_of(at, at.actions + change, spread),
-        "gripper": gripper,
+        "changes": units.changes(at, at.actions + change),
+        "chunk": units.chunk_change(at, at.actions + change),
+        "angle": first_angle(at.actions, at.actions + change) if known else np.full(len(replan), np.nan),
         "norms": [_norms(one, *place) for one, place in zip(at_places, places, strict=True)],
     }
 
@@ -324,7 +336,7 @@ def _norms(item: SelectedEpisode, site: str, selection: Selection, selectors: Se
     return norm
 
 
-def _rows(one: _Episode) -> pl.DataFrame:
+def _rows(one: _Episode, parts: Sequence[str]) -> pl.DataFrame:
     """`RecordedEffects.rows` of one episode."""
     item, arrays, measured = one
     effects = item.episode.attributes.effects
@@ -333,7 +345,8 @@ def _rows(one: _Episode) -> pl.DataFrame:
     conditions = pl.DataFrame(names, schema=dict.fromkeys(NAMES, pl.String))[arrays["condition"]]
     keys = episode_columns(item, _EPISODE, len(conditions))
     place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}
-    values = {name: arrays["changes"][:, i] for i, name in enumerate(CHANGES)} | {"gripper_effect": arrays["gripper"]}
+    values = {name: arrays["changes"][:, i] for i, name in enumerate(parts)}
+    values |= {_CHUNK: arrays["chunk"], _ANGLE: arrays["angle"]}
     rows = pl.DataFrame({**keys, **place, **conditions.to_dict(), **values}).filter(pl.col("kind") != "nothing")
     found = [
         means(at_site, ("replan",)).with_columns(norm=norm.ravel()).select("replan", "selector", *_ATTENTION)
@@ -345,7 +358,7 @@ def _rows(one: _Episode) -> pl.DataFrame:
     return joined.with_columns(pl.col(*values, *_ATTENTION).fill_nan(None))
 
 
-def _means(rows: pl.DataFrame, cells: Sequence[str]) -> pl.DataFrame:
+def _means(rows: pl.DataFrame, cells: Sequence[str], values: Sequence[str]) -> pl.DataFrame:
     """Means over the replans of each episode, condition and cell; of parts of the time by how long a replan lasts."""
     weight = pl.lit(1.0)
     if "phase" in cells:
@@ -358,31 +371,26 @@ def _means(rows: pl.DataFrame, cells: Sequence[str]) -> pl.DataFrame:
         rows = rows.join(parts, how="cross").with_columns(_weight=lasts).filter(pl.col("_weight") > 1e-12)
         weight = pl.col("_weight")
     names = [*_EPISODE, *cells, *NAMES]
-    squares = [
-        weighted(pl.col(of) ** 2, weight).alias(name)
-        for name, of in (("square", "effect"), ("gripper_square", "gripper_effect"))
-    ]
     return rows.group_by(names, maintain_order=True).agg(
         pl.len().cast(pl.Int64).alias("num_replans"),
-        *(weighted(pl.col(name), weight).alias(name) for name in (*CHANGES, *_ATTENTION)),
-        *squares,
+        *(weighted(pl.col(name), weight).alias(name) for name in values),
     )
 
 
-def _drift(episodes: Sequence[_Episode]) -> tuple[str, ...]:
+def _drift(episodes: Sequence[_Episode], units: ActionUnits) -> tuple[str, ...]:
     """How far calls without a change are from those that the robot executed, if rounding does not explain it."""
     most, where = 0.0, ""
     for item, arrays, _ in episodes:
         effects = item.episode.attributes.effects
         assert effects is not None
         nothing = [i for i, of in enumerate(effects.items) if of.change == "nothing"]
-        sizes = np.where(np.isin(arrays["condition"], nothing), arrays["changes"][:, CHANGES.index("effect_chunk")], 0)
+        sizes = np.where(np.isin(arrays["condition"], nothing), arrays["chunk"], 0)
         if sizes.size and sizes.max() > most:
             most = float(sizes.max())
             where = f"replan {int(arrays['replan'][sizes.argmax()])} of {item.episode.name}"
     if most <= _MOST_ROUNDING:
         return ()
     return (
-        f"Calls that were made again without any change differ from the executed ones by up to {most:.2g} standard "
-        f"deviations ({where}). Effects that are not far above that are none.",
+        f"Calls that were made again without any change differ from the executed ones: "
+        f"{units.said(f'up to {most:.2g}')} ({where}). Effects that are not far above that are none.",
     )

@@ -26,6 +26,7 @@ class AnalysisSettings:
     site: str | None = None
     intervals: Estimand = Estimand.TASKS_LIKE_THESE
     skip_corrupt: bool = False
+    units: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         known = [member.value for member in Estimand]
@@ -50,6 +51,7 @@ class SettingKeywords(TypedDict, total=False):
         site: the softmax family.
         intervals: what intervals are about: "tasks-like-these" or "these-tasks".
         skip_corrupt: whether damaged and empty episodes are left out.
+        units: groups of dimensions of the action in which effects are told, "NAME=DIMENSIONS:UNIT" or several.
     """
 
     grouping: str | Path | None
@@ -63,6 +65,7 @@ class SettingKeywords(TypedDict, total=False):
     site: str | None
     intervals: str
     skip_corrupt: bool
+    units: str | Sequence[str]
 
 
 def settings_from_keywords(**keywords: Any) -> AnalysisSettings:
@@ -126,5 +129,6 @@ _CONVERT: dict[str, Any] = {
     "layers": _whole_numbers,
     "heads": _whole_numbers,
     "tasks": _tasks,
+    "units": lambda value: tuple(map(str, _several(value))),
     "denoise": lambda value: tuple(map(str, _several(value))),
 }

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, TypeAlias
 
-from vla_attention.analyze.core.action_changes import ActionSpread, units_of_recorded
+from vla_attention.analyze.core.action_changes import ActionUnits, units_of
 from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, npy
 from vla_attention.analyze.view.paths import RUNS, NothingThere
@@ -45,7 +45,7 @@ class Answers:
     def __init__(self) -> None:
         self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._open: OrderedDict[tuple[str, str, str], ShownEpisode] = OrderedDict()
-        self._units: dict[tuple[str, int], ActionSpread] = {}
+        self._units: dict[tuple[str, int], ActionUnits] = {}
         self._lines: KnownLines = {}
 
     def answer(
@@ -109,11 +109,11 @@ class Answers:
             self._open.move_to_end(key)
             return self._open[key]
 
-    def _units_of(self, store: Store) -> ActionSpread:
+    def _units_of(self, store: Store) -> ActionUnits:
         """The units of effects, of the whole store as it is now."""
         key = str(store.path), len(store.episodes)
         if key not in self._units:
-            self._units[key] = units_of_recorded(store, skip_corrupt=True)
+            self._units[key] = units_of([store], skip_corrupt=True)
         return self._units[key]
 
 

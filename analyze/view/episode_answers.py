@@ -18,7 +18,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.ask import answer_to
-from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
+from vla_attention.analyze.core.action_changes import GRIPPER, ActionUnits
 from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
@@ -310,12 +310,13 @@ class ShownEpisode:
             weights = weights[:1]
         return {"keys": [[[int(key), float(line[key])] for key in np.flatnonzero(line)] for line in weights]}
 
-    def effects(self, units: ActionSpread) -> dict[str, Any] | None:
+    def effects(self, units: ActionUnits) -> dict[str, Any] | None:
         """`effects.json`: the numbers of `vla-attention effects` for one episode, item by item; None without any.
 
-        units: of the whole store. effect: at each replan, null where it was not measured; mean: over these.
+        units: of the whole store. parts: what is told of an item, the first as `mean`. effect: that at each replan,
+        null where it was not measured; mean: over these.
         """
-        found = recorded_effects(self.question(self._site_names[0]), spread=units)
+        found = recorded_effects(self.question(self._site_names[0]), units=units)
         if found is None:
             return None
         rows, replans = found.rows().collect(), range(self.episode.attributes.num_replans)
@@ -326,10 +327,11 @@ class ShownEpisode:
         for mean in found.episodes().iter_rows(named=True):
             effects = dict(rows.filter(condition=mean["condition"]).select("replan", "effect").iter_rows())
             items.append(
-                {name: mean[name] for name in (*NAMES, "noise", "lift")}
+                {name: mean[name] for name in (*NAMES, "noise", "lift", *units.names[1:])}
                 | {"number": numbers[mean["condition"]], "mean": mean["effect"], "effect": [*map(effects.get, replans)]}
             )
-        return {"items": items, "notes": list(found.notes)}
+        parts = [{"name": part.name, "title": part.title, "share": part.how == "opposite"} for part in units.parts]
+        return {"parts": parts, "said": units.said("{}"), "items": items, "notes": list(found.notes)}
 
     @property
     def drawn_effects(self) -> list[int]:

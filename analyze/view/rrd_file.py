@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vla_attention.analyze.core.action_changes import ActionSpread, units_of_recorded
+from vla_attention.analyze.core.action_changes import ActionUnits, units_of
 from vla_attention.analyze.core.camera_maps import (
     EpisodeMaps,
     episode_maps,
@@ -97,7 +97,7 @@ def write_recordings(path: Path, store: Store, episodes: Sequence[StoredEpisode]
     if path.suffix == STORE_SUFFIX:
         raise BadArgument(f"Cannot write recordings to {path}: it is named like a store; give NAME.rrd or a folder.")
     rr = rerun_library()
-    units = units_of_recorded(store) if any(one.attributes.effects for one in store.episodes) else None
+    units = units_of([store]) if any(one.attributes.effects for one in store.episodes) else None
     size = 0
     with writing("recordings", path, "another --rrd"), progress_bar(len(episodes), "episodes") as advance:
         for episode in episodes:
@@ -153,7 +153,7 @@ def logged(shown: ShownEpisode, about: Mapping[str, Any], effects: Sequence[Mapp
         yield Logged(("events",), "TextLog", {"text": event["text"]}, event["step"])
 
 
-def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionSpread | None) -> None:
+def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionUnits | None) -> None:
     """Write one episode."""
     about = shown.about()
     stream = rr.RecordingStream("vla-attention", recording_id=f"{shown.store.run} {shown.episode.name}")
@@ -209,7 +209,7 @@ def _about(shown: ShownEpisode, about: Mapping[str, Any]) -> str:
     )
 
 
-def shown_effects(shown: ShownEpisode, units: ActionSpread) -> list[dict[str, Any]]:
+def shown_effects(shown: ShownEpisode, units: ActionUnits) -> list[dict[str, Any]]:
     """The effects of taking an item away, or of other words, and the noise; from all queries where both were tried."""
     found = shown.effects(units)
     items = [] if found is None else found["items"]

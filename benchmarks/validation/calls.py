@@ -1,6 +1,7 @@
 """Stored policy calls made again under many interventions, without writing stores: actions only.
 
-The calls and the units of effects are those of `vla-capture rerun` and `vla-attention effects`; a test compares them.
+The calls are those of `vla-capture rerun`; a test compares them. Policies of different scales stand side by side here,
+so effects are in standard deviations of each run's own actions, which `vla-attention effects` takes last.
 """
 
 from __future__ import annotations
@@ -9,20 +10,16 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.action_changes import (
-    ActionSpread,
-    action_spread,
-    noise_of,
-    root_mean_square_change,
-    with_noise,
-)
+from vla_attention.analyze.core.action_changes import ActionSpread, action_spread, counted
+from vla_attention.analyze.statistics.intervals import estimates, ratio_of_means_over_episodes
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
 from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.interventions.resolution import TooFewKeys, interventions_for
@@ -40,8 +37,24 @@ Changes = Mapping[str, Interventions]
 NOTHING = "nothing"
 #: Another noise seed: the run's with this in place of its base.
 NOISE = Interventions(noise=NoiseChange(1000))
+#: A dimension that another noise seed changes by more than this many spreads is more than half noise: two draws of
+#: noise of variance v differ by 2 v on average.
+MOST_NOISE = 1.0
 #: More replans than any episode has.
 _ALL_REPLANS = 10**9
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Root mean square change by another noise seed over all replans and steps, in spreads.
+
+    change: (dimension,); NaN where there is no spread. low, high: ends (dimension,) of its interval over the episodes,
+    NaN where there is none (a single episode).
+    """
+
+    change: Array
+    low: Array
+    high: Array
 
 
 @dataclass(frozen=True)
@@ -61,7 +74,7 @@ class ChangedEpisode:
     executed: NDArray[np.int64]
 
     def effect(self, name: str, spread: ActionSpread, against: str | None = None) -> Array:
-        """Effects (replan,) as `vla-attention effects` measures them; against: another change instead of the store."""
+        """Effects (replan,) in spreads of the run; against: another change instead of the store."""
         base = self.base if against is None else self.actions[against]
         return root_mean_square_change(base, self.actions[name], spread, self.executed)
 
@@ -72,7 +85,7 @@ def spread_of(store: Store) -> ActionSpread:
 
 
 def units_of(policy: Any, store: Store, folder: Path, say: Callable[[str], None]) -> ActionSpread:
-    """The units of effects, those of `vla-attention effects` with a rerun under another noise seed.
+    """The units of effects: the spread of the run, of dimensions that are no noise.
 
     All policy calls of the store are made again with that seed, and dimensions of the action that it changes by more
     than their spread are left out: they would drown every effect.
@@ -81,6 +94,53 @@ def units_of(policy: Any, store: Store, folder: Path, say: Callable[[str], None]
     again = changed_episodes(policy, store, lambda episode: {"noise": NOISE}, _ALL_REPLANS, folder, say)
     pairs = [(episode.base, episode.actions["noise"]) for episode in again]
     return with_noise(spread, noise_of(pairs, spread.spread))
+
+
+def with_noise(spread: ActionSpread, noise: Noise) -> ActionSpread:
+    """The spread without the dimensions that another noise seed changes by more than they vary.
+
+    Such a dimension would make every effect as large as its noise. It is left out where the whole interval lies above
+    `MOST_NOISE`, so that no chance of the episodes decides; where all of them would be, all are kept.
+    """
+    mostly = spread.used & (noise.low > MOST_NOISE)
+    if mostly[spread.used].all():
+        return spread
+    return replace(spread, used=spread.used & ~mostly)
+
+
+def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
+    """The change by another noise seed, with its interval over episodes.
+
+    pairs: per episode the actions (replan, step, dimension) of the run, and those with other noise.
+    """
+    squares = np.array([((other - base) ** 2).sum(axis=(0, 1)) for base, other in pairs]).T  # (dimension, episode)
+    number = np.array([base.shape[0] * base.shape[1] for base, _ in pairs], dtype=np.float64)
+    statistic = ratio_of_means_over_episodes(squares, np.broadcast_to(number, squares.shape))
+    # The episodes are those of which the units are, whatever their tasks.
+    spreads = estimates([statistic], Units.of(np.zeros(len(pairs))))
+    # Several episodes that do not differ agree on the value; a single one says nothing of others.
+    values = np.array(
+        [(one.value, *(one.interval() or [one.value if len(pairs) > 1 else np.nan] * 2)) for one in spreads], np.float64
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return Noise(*np.where(spread > 0, np.sqrt(values.T) / spread, np.nan))
+
+
+def root_mean_square_change(base: Array, other: Array, spread: ActionSpread, steps: NDArray[np.int64]) -> Array:
+    """Root mean square over the first steps of each chunk, and over dimensions, of the change in units of the spread.
+
+    Args:
+        base, other: actions (replan, step, dimension).
+        spread: the units.
+        steps: (replan,) how many steps of each chunk count, at least 1.
+
+    Returns:
+        (replan,).
+    """
+    change = (other - base)[..., spread.used] / spread.spread[spread.used]
+    squares = (change**2).mean(axis=2)
+    result: Array = np.sqrt((squares * counted(steps, squares.shape[1])).sum(axis=1) / steps)
+    return result
 
 
 def chosen_replans(number: int, count: int) -> NDArray[np.int64]:

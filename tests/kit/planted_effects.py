@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.effects import EffectItem
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.groupings.words import words_of
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
 from vla_attention.schemas.layout import Role
 
 READERS = {"total": ("all", ""), "direct": ("action", ""), "pictures": ("prefix", "role:image")}
@@ -39,7 +40,8 @@ def item_of(name: str, change: str, queries: str, readers: str) -> EffectItem:
     return EffectItem(change, kind, item, reader="pictures" if readers else queries)
 
 
-def conditions() -> dict[str, tuple[Interventions, EffectItem, float]]:
+def conditions(alike: float = 0.0, exchanged: bool = False) -> dict[str, tuple[Interventions, EffectItem, float]]:
+    """By name; alike: the size of all changes, in place of their own. exchanged: words are exchanged for others too."""
     planted = {"unchanged": (Interventions("unchanged"), EffectItem("nothing"), 0.0)}
     planted["noise"] = (Interventions("noise", noise=NoiseChange(1)), EffectItem("noise"), NOISE)
     for name, (selector, sizes) in ITEMS.items():
@@ -51,26 +53,37 @@ def conditions() -> dict[str, tuple[Interventions, EffectItem, float]]:
         one = KeyKnockout(f'word:"{FIRST}"', queries=queries, query_selector=readers, random_seed=1)
         made = knockout_of_group("random", f"word_{FIRST}", one)
         planted[made.name] = (made, item_of(f"word_{FIRST}", "random", queries, readers), RANDOM)
-    return planted
+    for word, other in pairwise(WORDS) if exchanged else ():
+        made = Interventions(f"exchange_word_{word}", prompt=PromptChange("synonyms", synonyms={word: other}))
+        planted[made.name] = (made, EffectItem("prompt", "exchange", word, other), 1.0)
+    return {name: (*of, size and (alike or size)) for name, (*of, size) in planted.items()}
 
 
-def planted_effects(scale: Callable[[str, int, int, int], float] = lambda *_: 1.0) -> PlantEffects:
+def planted_effects(
+    scale: Callable[[str, int, int, int], float] = lambda *_: 1.0, alike: float = 0.0, exchanged: bool = False
+) -> PlantEffects:
     """Every dimension changes by the size, in the sign of a coin; words of other instructions have no entry.
 
-    scale: a factor of the size by the name of the condition, task, episode and replan.
+    scale: a factor of the size by the name of the condition, task, episode and replan. alike, exchanged: of
+    `conditions`.
     """
+    planted = conditions(alike, exchanged)
 
     def plant(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
-        return _effects_of(task, episode, replan, tokens, scale)
+        return _effects_of(task, episode, replan, tokens, scale, planted)
 
     return plant
 
 
 def _effects_of(
-    task: int, episode: int, replan: int, tokens: EpisodeTokens, scale: Callable[[str, int, int, int], float]
+    task: int,
+    episode: int,
+    replan: int,
+    tokens: EpisodeTokens,
+    scale: Callable[[str, int, int, int], float],
+    all_of: dict[str, tuple[Interventions, EffectItem, float]],
 ) -> ReplanEffects:
     known = INSTRUCTIONS[task % len(INSTRUCTIONS)].split()
-    all_of = conditions()
     measured, changes = [], []
     for number, (name, (*_, size)) in enumerate(all_of.items()):
         word = name.split("word_")[-1].split("_queries")[0] if "word_" in name else known[0]

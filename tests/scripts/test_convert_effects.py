@@ -28,7 +28,7 @@ def older(tmp_path):
 
 
 def test_the_script_gives_each_condition_the_item_that_a_capture_gives_it(older):
-    with pytest.raises(StoreError, match="scripts/convert_effects.py"):
+    with pytest.raises(StoreError, match="convert_effects"):
         va.open(older).effects()
     assert convert(older) == 6
     assert verify_store(open_store(older)) == []

@@ -2,41 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from typing import Any
 
 import polars as pl
 
 from vla_attention.analyze.commands.effects.data_set import deviation, has_dataset_actions
 from vla_attention.analyze.commands.effects.items import (
     FEW,
+    GRIPPER_MORE,
     IS_WORD,
     LESS,
     MORE,
+    MOST_NAMED,
     NO_NOISE,
     OPEN,
-    UNIT,
     by_item,
     columns_of_items,
     exchanged,
     figures_of_items,
+    named_sizes,
+    with_exchanges,
+    with_noise_row,
     with_untested,
 )
 from vla_attention.analyze.commands.effects.prompts import other_sentences
+from vla_attention.analyze.commands.effects.ways import unlike_attention, ways_of_words
 from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes, with_interval
-from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
+from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.recorded_effects import ITEM, RecordedEffects, recorded_effects, summary_of
 from vla_attention.analyze.core.result import Figure, Finding, Result, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, listing, plural
 
 _MISSING = "What if a word is left out?"
-#: Of the items, so many are named, and drawn over time.
-_MOST_NAMED, _MOST_DRAWN = 5, 4
-#: From this part of a squared effect on, it is said that it is the gripper's.
-_HALF = 0.5
+#: Of the items, so many are drawn over time.
+_MOST_DRAWN = 4
 _SIDES = ("pictures", "text")
 _OF_SIDE = pl.col("item_kind").is_in(_SIDES)
 
@@ -56,7 +61,7 @@ def effects(question: Question, by: Collection[str] = ()) -> Result:
             f"without each word and each picture: {how_to_record_effects(question)}"
         )
     findings, tables, figures = ([], [], []) if found is None else _recorded(found, by)
-    left_out = () if found is None else (*found.notes, *_left_out(found.spread))
+    left_out = () if found is None else found.notes
     return Result(
         "What the action depends on",
         about(question),
@@ -76,12 +81,13 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
     if found is None:
         said = "Not recorded: how the action changes without a word."
         return [Finding(said, _MISSING, next_step=how_to_record_effects(question))], []
-    episodes = found.episodes()
-    items = with_untested(question, by_item(summary_of(episodes, question.sampling)))
-    table = items.filter(IS_WORD)
-    columns = [column for column in columns_of_items(table) if column.name != "lift"]
-    otherwise, tables = other_sentences(question, episodes)
-    findings = [*exchanged(question, episodes), *otherwise, deciding(table, found.spread)]
+    episodes, units = found.episodes(), found.units
+    summary = summary_of(episodes, units, question.sampling)
+    table = _with_exchanges(question, episodes, with_untested(question, by_item(summary, units))).filter(IS_WORD)
+    columns = [column for column in columns_of_items(table, units) if column.name != "lift"]
+    otherwise, tables = other_sentences(question, episodes, units)
+    findings = [*exchanged(question, episodes, units), *otherwise, deciding(table, units, summary)]
+    table = with_noise_row(table, summary)
     return findings, [*tables, Table("word_effects", table, columns, "What the action does without a word")]
 
 
@@ -89,79 +95,92 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
     """Findings, tables and figures of recorded effects."""
     question, looks, episodes = found.question, columns_of(by), found.episodes(by)
     names = [column.name for column in looks]
-    summary = summary_of(episodes, question.sampling, names)
-    items = by_item(summary, names)
-    files = [
-        Table("effects_summary", summary),
-        Table("effects_episodes", episodes.drop("square", "gripper_square")),
-        Table("effects", found.rows()),
-    ]
-    shown = [*looks, *columns_of_items(items)]
-    otherwise, of_prompts = other_sentences(question, episodes, looks)
+    units = found.units
+    summary = summary_of(episodes, units, question.sampling, names)
+    items = by_item(summary, units, names)
+    files = [Table("effects_summary", summary), Table("effects_episodes", episodes), Table("effects", found.rows())]
+    otherwise, of_prompts = other_sentences(question, episodes, units, looks)
     if by:
         said = f"Below, a row for each item and {' and '.join(by)}."
         return (
             [Finding(said, "What does the action depend on?")],
-            [Table("effects_items", items, shown), *of_prompts, *files],
+            [Table("effects_items", items, [*looks, *columns_of_items(items, units)]), *of_prompts, *files],
             [],
         )
-    items = with_untested(question, items)
+    items = _with_exchanges(question, episodes, with_untested(question, items))
     of_words = pl.col("item_kind").is_in(["word", "exchange"])
     words, others = items.filter(IS_WORD), items.filter(~of_words)
-    findings = [*exchanged(question, episodes), *otherwise, deciding(words, found.spread)]
-    findings += [*_sides(question, episodes, items), *_others(others), *_ways(words)]
-    findings += _unlike_attention(words)
-    course = _over_time(found, items)
-    tables = [Table("effects_items", items, shown, "Without it, the action changes by", rows=16), *files]
-    return findings, [*of_prompts, *tables, Table("effects_time", course)], figures_of_items(items, course, summary)
+    findings = [*exchanged(question, episodes, units), *otherwise, deciding(words, units, summary)]
+    findings += [*_sides(question, episodes, units), *_others(others), *ways_of_words(question, episodes, words)]
+    findings += unlike_attention(words)
+    course, shown = _over_time(found, items), with_noise_row(items, summary)
+    columns = columns_of_items(shown, units)
+    tables = [Table("effects_items", shown, columns, "Without it, the action changes by", rows=16), *files]
+    figures = figures_of_items(items, course, summary, units)
+    return findings, [*of_prompts, *tables, Table("effects_time", course)], figures
 
 
-def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
-    """The words without which the action changes most, of the rows of `by_item` that are words."""
+def _with_exchanges(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> pl.DataFrame:
+    words = with_exchanges(question, episodes, items.filter(IS_WORD))
+    return pl.concat([words, items.filter(~IS_WORD)], how="diagonal")
+
+
+def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> Finding:
+    """The words without which the action changes most, of the rows of `by_item` that are words, with exchanges.
+
+    A word whose exchange for another one was tried and is not shown to do anything is none of them: a sentence with a
+    missing word is new to a policy, one with another word is not. summary: for what another noise seed does.
+    """
     tested = words.drop_nulls("effect").sort("effect", descending=True)
-    untested = words.height - tested.height
-    limits = [f"{plural(untested, 'word')} of the instructions not tested."] if untested else []
+    limits = [f"{plural(n, 'word')} of the instructions not tested."] if (n := words.height - tested.height) else []
     if tested.is_empty():
         return Finding("Not tested: no effect of a single word was recorded.", _MISSING, {}, " ".join(limits))
-    sure, few = tested.filter(than_noise=MORE), tested.filter(than_noise=FEW)
-    top = (sure if sure.height else tested).row(0, named=True)
-    without = f"{'Without' if top['reader'] == 'total' else 'Hidden from the action tokens,'} {top['label']}"
-    size = f"{with_interval(top, 'effect')} {UNIT}"
+    small = (pl.col("exchanged_than_noise") == OPEN) & (pl.col("exchanged") <= pl.col("noise"))
+    idle = (pl.col("exchanged_than_noise") == LESS) | small
+    moving = tested.filter(pl.col("than_noise").is_in([MORE, GRIPPER_MORE]))
+    held, sure = moving.filter(idle), moving.filter(~idle.fill_null(False))
+    far, few = sure.filter(than_noise=MORE), tested.filter(than_noise=FEW)
+    top = (far if far.height else tested).row(0, named=True)
+    size = units.said(with_interval(top, "effect"))
     noise = "" if top["noise"] is None else f" (another noise seed: {top['noise']:.2g})"
-    if sure.height:
-        said = f"{without} the action changes most: by {size}{noise}."
-        if sure.height > 1:
-            said += f" Also shown to change it by more than another noise seed does: {_named(sure[1:])}."
-        if (larger := tested.filter(pl.col("effect") > top["effect"])).height:
-            limits.insert(0, f"Larger, but not shown for other episodes: {_named(larger)}.")
+    if far.height:
+        said = f"{_without(top)} {size}{noise}."
+        said += f" Also more than noise: {named_sizes(far[1:])}." if far.height > 1 else ""
     elif few.height < tested.height:
-        said = f"No word is shown to change the action by more than another noise seed does. {without} it changes most "
-        said += f"here: by {size}{noise}."
+        said = f"No word is shown to do more than another noise seed. Most without {top['label']}: {size}{noise}."
     else:
-        said = f"{without} the action changes most in these episodes: by {size}{noise}."
-        said += f" Next: {_named(tested[1:])}." if tested.height > 1 else ""
+        said = f"{_without(top)} {size}{noise}, in these episodes."
+        said += f" Next: {named_sizes(tested[1:])}." if tested.height > 1 else ""
+    said += _of_gripper(sure, summary)
     if few.height:
-        limits.insert(0, f"Too few episodes to say more of {listing(few['label'], _MOST_NAMED)}.")
+        limits.insert(0, f"Too few episodes to say more of {listing(few['label'], MOST_NAMED)}.")
+    if held.height:
+        pairs = [f"{row['label']} ({row['effect']:.2g}; exchanged {row['exchanged']:.2g})" for row in held.to_dicts()]
+        limits.insert(0, f"Not counted, since another word in its place is not shown to do anything: "
+                         f"{listing(pairs, MOST_NAMED)}.")  # fmt: skip
     numbers = {"word": top["item"], "estimate": top["effect"], "low": top["effect_low"], "high": top["effect_high"],
                "noise": top["noise"], "shown": sure.height, "tested": tested.height}  # fmt: skip
-    if (top["grip_part"] or 0.0) >= _HALF:
-        said += f" The change without {top['label']} is {top['grip_part']:.0%} gripper: it is told the opposite in "
-        said += f"{top['grip']:.0%} of the steps, and as its commands hardly vary here (standard deviation "
-        said += (
-            f"{spread.spread[GRIPPER]:.2g}), that counts much; the hand's direction turns by {top['turn'] or 0.0:.0f} "
-        )
-        said += "degrees."
-        turn = tested.sort("turn", descending=True, nulls_last=True).row(0, named=True)
-        if turn["label"] != top["label"] and turn["turn"] is not None:
-            said += f" The hand's direction turns most without {turn['label']}: by {turn['turn']:.0f} degrees."
     return Finding(said, _MISSING, numbers, " ".join(limits))
 
 
-def _named(rows: pl.DataFrame, value: str = "effect") -> str:
-    return listing([f"{item} ({size:.2g})" for item, size in rows.select("label", value).iter_rows()], _MOST_NAMED)
+def _without(row: Mapping[str, Any]) -> str:
+    return f"{'Without' if row['reader'] == 'total' else 'Hidden from the action tokens,'} {row['label']}"
 
 
-def _sides(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> list[Finding]:
+def _of_gripper(words: pl.DataFrame, summary: pl.DataFrame) -> str:
+    """The words without which the gripper is shown to be told the opposite more often than with other noise."""
+    if "gripper" not in words.columns:
+        return ""
+    sure = words.filter(pl.col("gripper_q") <= NAMED_AT, pl.col("gripper_minus_noise") > 0).sort("gripper")
+    if sure.is_empty():
+        return ""
+    noise = summary.filter(kind="noise")["gripper"].drop_nulls().to_list()
+    beside = f" (another noise seed: {noise[0]:.0%})" if noise else ""
+    named = [f"{row['label']} in {row['gripper']:.0%}" for row in reversed(sure.to_dicts())]
+    return f" The gripper is told the opposite without {listing(named, MOST_NAMED)} of the steps{beside}."
+
+
+def _sides(question: Question, episodes: pl.DataFrame, units: ActionUnits) -> list[Finding]:
     """Without all pictures against without all text, in the episodes that have both."""
     rows = episodes.filter(_OF_SIDE, kind="without", reader="total")
     both = rows.pivot("item_kind", index=EPISODE_ID, values="effect").with_columns(side=pl.lit("pictures / text"))
@@ -172,16 +191,8 @@ def _sides(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> l
     one = row.row(0, named=True)
     if one["ratio"] is None:
         return []
-    said = (
-        f"Without all pictures the action changes {with_interval(one, 'ratio')} times as much as without all text "
-        f"({one['pictures']:.2g} and {one['text']:.2g})."
-    )
-    mostly = items.filter(_OF_SIDE, pl.col("grip_part") >= _HALF, kind="without")["label"].to_list()
-    said += (
-        f" Without {mostly[0] if len(mostly) == 1 else 'either'}, most of the change is the gripper's."
-        if mostly
-        else ""
-    )
+    said = f"Without all pictures {units.said(with_interval(one, 'pictures'))}, without all text "
+    said += f"{with_interval(one, 'text')}: {with_interval(one, 'ratio')} times as much."
     numbers = {"estimate": one["ratio"], "low": one["ratio_low"], "high": one["ratio_high"], "n": one["num_episodes"]}
     return [Finding(said, "Pictures or text?", numbers, enough(question))]
 
@@ -191,50 +202,21 @@ def _others(items: pl.DataFrame) -> list[Finding]:
     items = items.filter(pl.col("than_noise") != NO_NOISE)
     if items.is_empty():
         return []
-    sure, less = items.filter(than_noise=MORE), items.filter(than_noise=LESS)
-    rest = items.height - sure.height - less.height
-    parts = [f"Changed by more than by another noise seed: without {_named(sure)}"] if sure.height else []
-    parts += [f"Changed less: without {_named(less)}"] if less.height else []
-    parts += [f"Not shown to be changed by more: {plural(rest, 'other item') if parts else 'any item'}"] if rest else []
-    numbers = {"shown": sure.height, "smaller": less.height, "open": rest}
+    kinds = [items.filter(than_noise=kind) for kind in (MORE, GRIPPER_MORE, LESS)]
+    sure, flips, less = kinds
+    rest = items.height - sum(kind.height for kind in kinds)
+    sizes = ((sure, "More than with another noise seed", "effect"), (flips, "The gripper alone", "gripper"),
+             (less, "Less than with another noise seed", "effect"))  # fmt: skip
+    parts = [f"{said}: {_without_and_with(rows, value)}" for rows, said, value in sizes if rows.height]
+    parts += [f"Not shown to be either: {plural(rest, 'other item') if parts else 'any item'}"] if rest else []
+    numbers = {"shown": sure.height, "gripper": flips.height, "smaller": less.height, "open": rest}
     return [Finding(f"{'. '.join(parts)}.", "And without something else?", numbers)] if parts else []
 
 
-def _ways(words: pl.DataFrame) -> list[Finding]:
-    """Which of the shown words the action tokens read themselves, and which act through what has read them."""
-    words = words.filter(than_noise=MORE).drop_nulls(["total", "direct"])
-    half = 2 * pl.col("direct") >= pl.col("total")
-    own, rest = words.filter(half), words.filter(~half)
-    seen = (2 * pl.col("pictures") >= pl.col("total")).fill_null(False)
-    parts = [f"the action tokens read {listing(own['label'], _MOST_NAMED)} themselves"] if own.height else []
-    for is_it, through in ((seen, "the pictures, which have read it"), (~seen, "other tokens")):
-        part = rest.filter(is_it)
-        if part.height:
-            sizes = sorted(part["direct"].to_list())
-            alone = f"hidden from the action tokens alone: {sizes[0]:.2g}"
-            alone += f" to {sizes[-1]:.2g}" if part.height > 1 else ""
-            parts.append(f"{listing(part['label'], _MOST_NAMED)} acts through {through} ({alone})")
-    said = "; ".join(parts)
-    return [Finding(f"{said[0].upper()}{said[1:]}.", "How do these words reach the action?")] if parts else []
-
-
-def _unlike_attention(words: pl.DataFrame) -> list[Finding]:
-    """Words whose attention says something else than their effect."""
-    silent = words.filter(pl.col("lift") < 1, than_noise=MORE)
-    idle = words.filter(pl.col("lift") > 1, pl.col("than_noise").is_in([OPEN, LESS]))
-    parts = (
-        [f"less than its share, and the action changes without it: {_named(silent, 'lift')}"] if silent.height else []
-    )
-    parts += [f"more than its share, and no change is shown without it: {_named(idle, 'lift')}"] if idle.height else []
-    said = "; ".join(parts)
-    limit = "In brackets: attention to the word, evenly spread over all tokens = 1."
-    return [Finding(f"{said[0].upper()}{said[1:]}.", "Does attention tell?", limit=limit)] if parts else []
-
-
-def _left_out(spread: ActionSpread) -> list[str]:
-    """The dimensions of the action that are not compared, and why."""
-    parts = [f"{i} ({why})" for i, why in enumerate(spread.reasons) if why]
-    return [f"Dimensions of the action that are not compared: {listing(parts, 20)}."] if parts else []
+def _without_and_with(rows: pl.DataFrame, value: str) -> str:
+    image = pl.col("kind") == "image"
+    sides = (("without", rows.filter(~image)), ("with", rows.filter(image)))
+    return "; ".join(f"{word} {named_sizes(part, value)}" for word, part in sides if part.height)
 
 
 def _over_time(found: RecordedEffects, items: pl.DataFrame) -> pl.DataFrame:

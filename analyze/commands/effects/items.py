@@ -8,8 +8,9 @@ from typing import get_args
 import polars as pl
 
 from vla_attention.analyze.core.about import with_interval
+from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.recorded_effects import ITEM
+from vla_attention.analyze.core.recorded_effects import ITEM, times
 from vla_attention.analyze.core.result import Column, Figure, Finding
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
@@ -17,29 +18,35 @@ from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.interventions import PromptKind
 
-#: Whether an item is shown to change the action by more than another noise seed does.
-MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
-    "more", "not shown to be more", "smaller", "too few episodes", "not tested", "not recorded"
+#: Whether an item is shown to change the action by more than another noise seed does: what ranks it, or the gripper.
+MORE, GRIPPER_MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
+    "more", "the gripper's is", "not shown to be more", "less", "too few episodes", "not tested", "not recorded"
 )  # fmt: skip
 _SHOWN_KINDS = ("without", "only", "prompt", "image")
 #: In the order of tables and pictures.
 _KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "token", "exchange")
 _READERS = ("total", "direct", "pictures", "text")
 _ALWAYS = ("label", "than_noise")
-UNIT = "standard deviations of the run's actions"
-
-
 #: The rows of calls without a word.
 IS_WORD = (pl.col("kind") == "without") & (pl.col("item_kind") == "word")
 
 
-def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
+#: Of the items, so many are named.
+MOST_NAMED = 5
+
+
+def named_sizes(rows: pl.DataFrame, value: str = "effect") -> str:
+    """Items with a value of theirs in brackets: "'red' (4.3), 'blue' (6.9) and 3 more"."""
+    return listing([f"{item} ({size:.2g})" for item, size in rows.select("label", value).iter_rows()], MOST_NAMED)
+
+
+def by_item(summary: pl.DataFrame, units: ActionUnits, looks: Sequence[str] = ()) -> pl.DataFrame:
     """One row per item (and cell of the columns `looks`), words first, the largest effects of each kind first.
 
     Returns:
-        looks, `ITEM`, condition, reader; effect: that of the reader `total`, or where it was not recorded of
-        `direct`; in its row of `RecordedEffects.summary` turn, grip, grip_part, lift, noise, q and num_episodes;
-        than_noise; and the effect of every reader. Effects have intervals.
+        looks, `ITEM`, condition, reader; effect: that of the reader `total`, or where it was not recorded of `direct`;
+        in its row of `summary_of` the further parts (turn, gripper, ...), lift, lift_q, noise, q, gripper_q and
+        num_episodes; than_noise; and the effect of every reader. Effects have intervals.
     """
     names = [*looks, *ITEM]
     # Other sentences are no items: `prompts` has them, by what they are.
@@ -47,10 +54,11 @@ def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
     rows = summary.filter(is_item).with_columns(pl.col("reader").fill_null("total"))
     of_total = rows.filter(reader="total")
     direct = rows.filter(reader="direct").join(of_total, on=names, how="anti", nulls_equal=True)
+    gripper = {"gripper_q": "gripper_minus_noise_q", "gripper_minus_noise": "gripper_minus_noise"}
+    gripper = gripper if "gripper_minus_noise_q" in summary.columns else {}
     found = pl.concat([of_total, direct]).select(
-        *names, "condition", "reader", *_with_ends("effect"), turn="angle", grip="gripper_flips",
-        grip_part="gripper_part", lift="lift", noise="noise", than_noise=against_noise(), q="times_noise_q",
-        num_episodes="num_episodes",
+        *names, "condition", "reader", *_with_ends("effect"), *units.names[1:], "lift", "lift_q", "noise",
+        than_noise=against_noise(bool(gripper)), q="times_noise_q", num_episodes="num_episodes", **gripper,
     )  # fmt: skip
     for reader in _READERS:
         part = rows.filter(reader=reader).select(*names, *_with_ends("effect", reader))
@@ -60,15 +68,20 @@ def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
     return found.sort(*looks, order, "effect", descending=down, nulls_last=True, maintain_order=True)
 
 
-def against_noise() -> pl.Expr:
-    """Whether the effect of a row is shown to be more than that of another noise seed, from times_noise and its q."""
+def against_noise(gripper: bool = False) -> pl.Expr:
+    """Whether the effect of a row is shown to be more, or less, than that of another noise seed.
+
+    gripper: whether rows have the gripper's test beside.
+    """
     # On the scale of the effects themselves, which differ by factors: a difference would be of the largest episodes.
     q, above = pl.col("times_noise_q"), pl.col("times_noise")
+    flips = (pl.col("gripper_minus_noise_q") <= NAMED_AT) & (pl.col("gripper_minus_noise") > 0)
     return (
         pl.when(above.is_null()).then(pl.lit(NO_NOISE))
-        .when(above <= 0).then(pl.lit(LESS))
+        .when((q <= NAMED_AT) & (above > 0)).then(pl.lit(MORE))
+        .when(flips if gripper else pl.lit(False)).then(pl.lit(GRIPPER_MORE))
         .when(q.is_null()).then(pl.lit(FEW))
-        .when(q <= NAMED_AT).then(pl.lit(MORE))
+        .when(q <= NAMED_AT).then(pl.lit(LESS))
         .otherwise(pl.lit(OPEN))
     )  # fmt: skip
 
@@ -86,40 +99,52 @@ def with_untested(question: Question, items: pl.DataFrame) -> pl.DataFrame:
     return pl.concat([words, pl.DataFrame(rows, schema=schema, orient="row"), others], how="diagonal")
 
 
-def exchanged(question: Question, episodes: pl.DataFrame) -> list[Finding]:
+def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) -> list[Finding]:
     """Whether it tells words apart: how far the action moves with one exchanged for another, which tasks also have."""
-    is_exchange = pl.col("item_kind").is_in(["exchange", "exchanged"])
-    rows = episodes.filter(is_exchange, kind="prompt").group_by(*EPISODE_ID, maintain_order=True)
-    of_episodes = rows.agg(pl.mean("effect", "noise"), words=pl.col("label"))
-    if of_episodes.is_empty():
+    rows = episodes.filter(pl.col("item_kind").is_in(["exchange", "exchanged"]), kind="prompt")
+    if rows.is_empty():
         return []
-    of_episodes = of_episodes.with_columns(
-        what=pl.lit("any word"), times_noise=(pl.col("effect") / pl.col("noise")).log()
-    )
-    sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
-    row = estimate(of_episodes, ["what"], sizes, question.sampling, {"times_noise": 0.0}).row(0, named=True)
-    words = of_episodes["words"].explode().unique().sort().to_list()
-    said = (
-        f"with a word exchanged for another ({listing(words, 2)}) the action moves by {with_interval(row, 'effect')} "
-    )
-    said += f"{UNIT}" + ("" if row["noise"] is None else f"; another noise seed moves it by {row['noise']:.2g}")
-    verdict = ""
-    if row["times_noise"] is not None and row["times_noise_q"] is not None and row["times_noise_q"] <= NAMED_AT:
-        verdict = "It does: " if row["times_noise"] > 0 else "Not shown, and less than noise: "
+    row = _of_exchanges(rows.with_columns(what=pl.lit("any word")), ["what"], question).row(0, named=True)
+    words = rows["label"].unique().sort().to_list()
+    said = f"with a word exchanged for another ({listing(words, 2)}) {units.said(with_interval(row, 'effect'))}"
+    said += "" if row["noise"] is None else f"; with another noise seed {row['noise']:.2g}"
+    verdict, limit = {
+        MORE: ("It does: ", ""), LESS: ("It does not: ", "")
+    }.get(row["than_noise"], ("", "Not shown to be more than noise."))  # fmt: skip
     numbers = {"estimate": row["effect"], "low": row["effect_low"], "high": row["effect_high"], "noise": row["noise"],
                "q": row["times_noise_q"], "n": row["num_episodes"]}  # fmt: skip
-    limit = "" if verdict else "Not shown to be more than noise."
     said = f"{verdict}{said}." if verdict else f"{said[0].upper()}{said[1:]}."
     return [Finding(said, "Does it tell words apart?", numbers, limit)]
 
 
-def figures_of_items(items: pl.DataFrame, course: pl.DataFrame, summary: pl.DataFrame) -> list[Figure]:
+def with_exchanges(question: Question, episodes: pl.DataFrame, words: pl.DataFrame) -> pl.DataFrame:
+    """The rows of words with what exchanging each for another word does: exchanged, and exchanged_than_noise."""
+    rows = episodes.filter(item_kind="exchange", kind="prompt")
+    if rows.is_empty():
+        return words.with_columns(exchanged=pl.lit(None, pl.Float64), exchanged_than_noise=pl.lit(None, pl.String))
+    found = _of_exchanges(rows, ["item"], question)
+    found = found.select("item", exchanged="effect", exchanged_than_noise="than_noise")
+    return words.join(found, on="item", how="left", maintain_order="left")
+
+
+def _of_exchanges(rows: pl.DataFrame, by: Sequence[str], question: Question) -> pl.DataFrame:
+    """Means over the exchanges of each episode, estimated: effect, noise, times_noise with q, than_noise."""
+    of_episodes = rows.group_by(*EPISODE_ID, *by, maintain_order=True).agg(pl.mean("effect", "noise"))
+    of_episodes = of_episodes.with_columns(times_noise=times("effect", "noise"))
+    sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
+    found = estimate(of_episodes, by, sizes, question.sampling, {"times_noise": 0.0})
+    return found.with_columns(than_noise=against_noise())
+
+
+def figures_of_items(
+    items: pl.DataFrame, course: pl.DataFrame, summary: pl.DataFrame, units: ActionUnits
+) -> list[Figure]:
     """Effects by item; over time; and beside attention."""
     noise = summary.filter(kind="noise")["effect"].drop_nulls().mean()
     n = "Means over episodes, every task weighing the same; {}: 95% intervals."
     floor = {} if noise is None else {"baseline": noise, "baseline_name": "another noise seed"}
     items = items.with_columns(color=pl.col("item_kind").replace({"camera": "pictures", "part": "text"}))
-    by_kind, change = {"color": "color"}, "change (standard deviations)"
+    by_kind, change = {"color": "color"}, units.title
     forest = {"value": "effect", "label": "label", "xlabel": change, "log": True, **floor, **by_kind}
     title = "How the action changes without it, or with it exchanged"
     found = [Figure("effects_by_item", "forest", items, title, n.format("bars"), forest)]
@@ -137,20 +162,30 @@ def figures_of_items(items: pl.DataFrame, course: pl.DataFrame, summary: pl.Data
     return found
 
 
-def columns_of_items(items: pl.DataFrame) -> list[Column]:
+def columns_of_items(items: pl.DataFrame, units: ActionUnits) -> list[Column]:
     """The columns of the rows of `by_item` that are shown; those that nothing was recorded of are not."""
     columns = [
         Column("label", "text", "without, or changed"),
-        Column("total", "number", "nobody reads it", f"how far the action moves then, in {UNIT}"),
+        Column("total", "number", units.title, f"where nobody reads it, {units.said('so much')}"),
         Column("direct", "number", "action tokens do not", "the same, while others may read it"),
+        *units.further_columns,
         Column("than_noise", "text", "than noise", "whether that is shown to be more than another noise seed does"),
-        Column("turn", "number", "turn", "of the hand's direction, in degrees"),
-        Column("grip", "percent", "gripper", "steps in which it is told the opposite"),
+        Column("exchanged", "number", "exchanged", "the same with the word exchanged for another one"),
         Column("lift", "factor", "attention", "per token, evenly spread = 1"),
-        Column("noise", "number", "another noise", "how far another seed moves it there"),
+        Column("noise", "number", "another noise", "how far another seed moves it there", False),
         Column("num_episodes", "count", "episodes"),
         Column("pictures", "number", "pictures do not", "the same if the tokens of pictures do not read it", False),
         Column("text", "number", "text does not", "the same if the tokens of the prompt do not read it", False),
         Column("q", "p", "q", "p of no difference from another noise seed, adjusted for the number of rows", False),
     ]
-    return [column for column in columns if column.name in _ALWAYS or items[column.name].drop_nulls().len()]
+    having = [column for column in columns if column.name in items.columns]
+    return [column for column in having if column.name in _ALWAYS or items[column.name].drop_nulls().len()]
+
+
+def with_noise_row(items: pl.DataFrame, summary: pl.DataFrame) -> pl.DataFrame:
+    """The items, and what another noise seed alone does behind them."""
+    noise = summary.filter(kind="noise")
+    if noise.is_empty():
+        return items
+    row = noise.select([name for name in noise.columns if name in items.columns]).with_columns(total="effect")
+    return pl.concat([items, row.select(pl.exclude("lift", "lift_q", "noise", "q"))], how="diagonal")

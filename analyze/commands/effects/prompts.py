@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from vla_attention.analyze.commands.effects.items import MORE, UNIT, against_noise
+from vla_attention.analyze.commands.effects.items import MORE, against_noise
 from vla_attention.analyze.core.about import with_interval
+from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.directions import directions, things_of_sentences
 from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.recorded_effects import times
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
@@ -21,7 +23,7 @@ _ANY = "any of these"
 
 
 def other_sentences(
-    question: Question, episodes: pl.DataFrame, looks: Sequence[Column] = ()
+    question: Question, episodes: pl.DataFrame, units: ActionUnits, looks: Sequence[Column] = ()
 ) -> tuple[list[Finding], list[Table]]:
     """How far each kind of sentence moves the action beside another noise seed, and whether towards what it names.
 
@@ -33,7 +35,7 @@ def other_sentences(
         return [], []
     names = dict.fromkeys([*EPISODE_ID, *cells, "sentence"])
     rows = rows.group_by(*names, maintain_order=True).agg(pl.mean("effect", "noise"))
-    rows = rows.with_columns(times_noise=(pl.col("effect") / pl.col("noise")).log())
+    rows = rows.with_columns(times_noise=times("effect", "noise"))
     sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
     found = estimate(
         rows, [*cells, "sentence"], sizes, question.sampling, {"times_noise": 0.0}, cells,
@@ -41,16 +43,17 @@ def other_sentences(
     )  # fmt: skip
     down = [*(False for _ in cells), True]
     found = found.with_columns(than_noise=against_noise()).sort(*cells, "effect", descending=down)
-    table = Table("effects_prompts", found, [*looks, *_SENTENCES], "Told something else, the action changes by")
+    shown = [*looks, *_columns(units)]
+    table = Table("effects_prompts", found, shown, "Told something else, the action changes by")
     if looks:
         return [], [table]
-    towards, where = _towards(question)
-    return [_moves(found), *towards], [table, *where]
+    towards, where = _towards(question, units)
+    return [_moves(found, units), *towards], [table, *where]
 
 
-def _moves(found: pl.DataFrame) -> Finding:
+def _moves(found: pl.DataFrame, units: ActionUnits) -> Finding:
     sure, has_noise = found.filter(than_noise=MORE), found["over_noise"].count() > 0
-    size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", UNIT)
+    size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", units.title)
     sizes = dict(found.drop_nulls(size).select("sentence", size).iter_rows())
     said = "Other words move the action" if sure.height else "No other words are shown to move the action"
     said += f": {listing([f'{kind} {value:.3g}' for kind, value in sizes.items()], 6)} {unit}."
@@ -58,8 +61,10 @@ def _moves(found: pl.DataFrame) -> Finding:
     return Finding(said, "Do other words move it?", sizes | {"n": found["num_episodes"].max()}, limit)
 
 
-def _towards(question: Question) -> tuple[list[Finding], list[Table]]:
-    rows, unknown = directions(question.selected, things_of_sentences(question.stores))
+def _towards(question: Question, units: ActionUnits) -> tuple[list[Finding], list[Table]]:
+    if units.centimetres is None:
+        return [], []
+    rows, unknown = directions(question.selected, things_of_sentences(question.stores), units.centimetres / 100)
     if rows.is_empty():
         return [], []
     names = ("changed", "unchanged", "closer")
@@ -77,14 +82,17 @@ def _towards(question: Question) -> tuple[list[Finding], list[Table]]:
     return [Finding(said, "Towards what the words name?", numbers, left if unknown else "")], [table]
 
 
-_SENTENCES = [
-    Column("sentence", "text", "told", "what the sentence is to the task's own"),
-    Column("effect", "number", "change", f"how far the action moves then, in {UNIT}"),
-    Column("over_noise", "factor", "times noise", "that, over how far another noise seed moves it"),
-    Column("than_noise", "text", "than noise", "whether that is shown to be more than another noise seed does"),
-    Column("noise", "number", "another noise", screen=False),
-    Column("num_episodes", "count", "episodes"),
-]
+def _columns(units: ActionUnits) -> list[Column]:
+    return [
+        Column("sentence", "text", "told", "what the sentence is to the task's own"),
+        Column("effect", "number", units.title, units.said("so much")),
+        Column("over_noise", "factor", "times noise", "that, over how far another noise seed moves it"),
+        Column("than_noise", "text", "than noise", "whether that is shown to be more than another noise seed does"),
+        Column("noise", "number", "another noise", screen=False),
+        Column("num_episodes", "count", "episodes"),
+    ]
+
+
 _DIRECTIONS = [
     Column("sentence", "text", "told"),
     Column("changed", "signed", "cm closer", "to the thing that the words name, summed over the executed steps"),

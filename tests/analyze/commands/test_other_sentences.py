@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -72,11 +73,20 @@ def store(tmp_path_factory):
 def test_kinds_have_the_planted_sizes_beside_the_noise(store):
     result = effects(question_about(store, intervals="these-tasks"))
     table = {row["sentence"]: row for row in result["effects_prompts"].iter_rows(named=True)}
-    noise = SIZES[0] * np.mean([noise_of(task, episode) for task in SPEC.tasks for episode in range(SPEC.episodes)])
-    for row, size in zip(ROWS, SIZES[1:], strict=True):
-        assert table[row.kind]["over_noise"] == pytest.approx(size / noise, rel=1e-6)
+    tokens, ends = question_about(store).selected[0].tokens, []
+    for task, episode in product(SPEC.tasks, range(SPEC.episodes)):
+        steps = num_steps(SPEC, episode)
+        of_replans = [
+            plant(task, episode, replan, tokens).change[:, : min(5, steps - 5 * replan), :3].sum(axis=1)
+            for replan in range(SPEC.num_replans)
+        ]
+        ends.append(np.linalg.norm(of_replans, axis=2).mean(axis=0))  # (condition,)
+    noise, *sizes = np.mean(ends, axis=0)
+    for row, size in zip(ROWS, sizes, strict=True):
+        assert table[row.kind]["effect"] == pytest.approx(100 * STEP * size, rel=1e-4)
+        assert table[row.kind]["over_noise"] == pytest.approx(size / noise, rel=1e-4)
         assert (table[row.kind]["than_noise"], table[row.kind]["num_episodes"]) == (
-            "smaller" if row.kind == "paraphrased" else "more", 12,
+            "less" if row.kind == "paraphrased" else "more", 12,
         )  # fmt: skip
     assert result["effects_items"].filter(item_kind="word", than_noise="not tested").height
     assert effects(question_about(store), by=["task"])["effects_prompts"].height == len(ROWS) * 3
@@ -86,7 +96,7 @@ def test_the_steps_go_towards_the_named_thing_by_the_planted_metres(store):
     question = question_about(store)
     names = things_of_sentences(question.stores)
     assert names[tuple(INSTRUCTIONS[1].split())] == {"akita_black_bowl_1", "plate_1"}
-    rows, unknown = directions(question.selected, names | CABINETS)
+    rows, unknown = directions(question.selected, names | CABINETS, STEP)
     assert (rows.height, unknown) == (12, 1)
     assert {*rows["sentence"]} == {"other task"}
     for row in rows.iter_rows(named=True):

@@ -22,7 +22,7 @@ from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import write_site_store
 from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.core.action_changes import units_of_recorded
+from vla_attention.analyze.core.action_changes import units_of
 from vla_attention.analyze.view import rrd_file
 from vla_attention.analyze.view.episode_answers import ShownEpisode
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
@@ -75,7 +75,7 @@ def as_logged(path: Path, name: str) -> Recording:
     store, found = open_store(path), Recording()
     (episode,) = [one for one in store.episodes if one.name == name]
     shown = ShownEpisode(store, episode)
-    units = units_of_recorded(store) if episode.attributes.effects else None
+    units = units_of([store]) if episode.attributes.effects else None
     effects = [] if units is None else rrd_file.shown_effects(shown, units)
     for one in rrd_file.logged(shown, shown.about(), effects):
         for field, values in one.values.items():
