@@ -313,8 +313,8 @@ class ShownEpisode:
     def effects(self, units: ActionUnits) -> dict[str, Any] | None:
         """`effects.json`: the numbers of `vla-attention effects` for one episode, item by item; None without any.
 
-        units: of the whole store. parts: what is told of an item, the first as `mean`. effect: that at each replan,
-        null where it was not measured; mean: over these.
+        units: of the whole store. effect: the first of their parts at each replan, null where it was not measured;
+        mean: over these; further: that of the other parts.
         """
         found = recorded_effects(self.question(self._site_names[0]), units=units)
         if found is None:
@@ -327,7 +327,8 @@ class ShownEpisode:
         for mean in found.episodes().iter_rows(named=True):
             effects = dict(rows.filter(condition=mean["condition"]).select("replan", "effect").iter_rows())
             items.append(
-                {name: mean[name] for name in (*NAMES, "noise", "lift", *units.names[1:])}
+                {name: mean[name] for name in (*NAMES, "noise", "lift")}
+                | {"further": [mean[name] for name in units.names[1:]]}
                 | {"number": numbers[mean["condition"]], "mean": mean["effect"], "effect": [*map(effects.get, replans)]}
             )
         parts = [{"name": part.name, "title": part.title, "share": part.how == "opposite"} for part in units.parts]

@@ -130,13 +130,15 @@ class Logged:
     steps: int | Sequence[int] | None = None
 
 
-def logged(shown: ShownEpisode, about: Mapping[str, Any], effects: Sequence[Mapping[str, Any]]) -> Iterator[Logged]:
+def logged(
+    shown: ShownEpisode, about: Mapping[str, Any], effects: Sequence[Mapping[str, Any]], units: ActionUnits | None
+) -> Iterator[Logged]:
     """Everything that a recording of an episode holds but for its arrangement.
 
-    about: of `ShownEpisode`; effects: of `shown_effects`, none where none was measured.
+    about: of `ShownEpisode`; effects: of `shown_effects`, in `units`, none where none was measured.
     """
     starts = about["starts"]
-    yield Logged(("about",), "TextDocument", {"text": _about(shown, about), "media_type": _MARKDOWN})
+    yield Logged(("about",), "TextDocument", {"text": _about(shown, about, units), "media_type": _MARKDOWN})
     sites = [site.name for site in shown.store.attributes.sites]
     for site in sites:
         before = (site,) if len(sites) > 1 else ()
@@ -166,7 +168,7 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionUnits | None) 
     stream.send_recording_name(f"{shown.store.suite}: {about['told'] or about['instruction']} ({shown.episode.name})")
     if about["courses"]:
         stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for one in logged(shown, about, effects):
+    for one in logged(shown, about, effects, units):
         _log(rr, stream, one)
     path.write_bytes(memory.drain_as_bytes())
     stream.disconnect()
@@ -199,13 +201,14 @@ def _series(
             yield Logged((*place, name), "SeriesLines", look)
 
 
-def _about(shown: ShownEpisode, about: Mapping[str, Any]) -> str:
+def _about(shown: ShownEpisode, about: Mapping[str, Any], units: ActionUnits | None) -> str:
     root = shown.store.attributes
     return (
         f"**{about['verdict']}**\n\nSuite {visible(shown.store.suite)}, task {about['task']}, episode "
         f"{about['episode']}; policy {visible(root.policy.name)}; run {shown.store.run[:8]}.\n\nAttention of the "
         "action queries, mean over layers, denoise steps and heads. *Times even*: what a word or patch gets, divided "
-        "by what it would get if attention were spread evenly. *Effect*: how far the action moves without the item."
+        "by what it would get if attention were spread evenly."
+        + ("" if units is None else f" *Effect*: without the item, {units.said('so much')} ({units.title}).")
     )
 
 

@@ -77,7 +77,7 @@ def as_logged(path: Path, name: str) -> Recording:
     shown = ShownEpisode(store, episode)
     units = units_of([store]) if episode.attributes.effects else None
     effects = [] if units is None else rrd_file.shown_effects(shown, units)
-    for one in rrd_file.logged(shown, shown.about(), effects):
+    for one in rrd_file.logged(shown, shown.about(), effects, units):
         for field, values in one.values.items():
             column = found.setdefault("/" + "/".join(one.place), {}).setdefault(f"{one.kind}:{field}", {})
             if isinstance(one.steps, Sequence):

@@ -161,12 +161,25 @@ export interface Effect {
   readonly reader: string | null;
   readonly effect: readonly (number | null)[];
   readonly mean: number | null;
+  /** Means of the parts behind the first. */
+  readonly further: readonly (number | null)[];
   /** Another noise seed's effect. */
   readonly noise: number | null;
   readonly lift: number | null;
 }
 
+/** What an effect is told by: the first part is `effect` and `mean` of an item, the others are `further`. */
+export interface EffectPart {
+  readonly name: string;
+  readonly title: string;
+  /** Whether it is a share of the steps. */
+  readonly share: boolean;
+}
+
 export interface Effects {
+  readonly parts: readonly EffectPart[];
+  /** How a sentence has a number of the first part: "the hand ends {} cm elsewhere". */
+  readonly said: string;
   readonly items: readonly Effect[];
   readonly notes: readonly string[];
 }

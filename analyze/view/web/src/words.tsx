@@ -29,7 +29,7 @@ const shades = computed<readonly Shaded[]>(() => {
   return values.map((one) => {
     const none = shade.value !== "attention" && !(of(one) > one.noise);
     const read = `attention per token: ${shown(one.lift)} times even`;
-    const moved = Number.isFinite(one.effect) ? `; without it the action moves by ${shown(one.effect)} (another noise seed: ${shown(one.noise)})` : "";
+    const moved = Number.isFinite(one.effect) ? `; without it ${effects.value.value?.said.replace("{}", shown(one.effect))} (another noise seed: ${shown(one.noise)})` : "";
     return { strength: none || !Number.isFinite(of(one)) ? 0 : Math.max(0, of(one) / highest), none, title: `${read}${moved}` };
   });
 });
