@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import vla_attention as va
+from tests.kit.archives import unpacked
+from tests.kit.paths import GOLDEN
 from tests.kit.site_stores import write_site_store
 from tests.kit.stores import small_effects, write_store
 from vla_attention.analyze.core.action_changes import (
@@ -125,6 +127,18 @@ def test_units_are_those_of_the_whole_store_whatever_is_selected():
     one = store.effects(tasks=2)["effects"]
     every = store.effects()["effects"].filter(task_id=2)
     assert one["effect"].to_list() == pytest.approx(every["effect"].to_list(), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "parts", "centimetres"),
+    [("cosmos", 3, 1.27), ("cubes", 3, 1.17), ("libero", 1, None), ("replay", 1, None)],
+    ids=["Cosmos in robosuite", "pi in cubes", "a controller that no factor explains", "a data set, without steps"],
+)
+def test_stores_tell_how_their_commands_move_the_hand(name, parts, centimetres):
+    """robosuite's controller moves the hand by some part of 5 cm for a command of 1, whatever policy commands."""
+    units = units_of([open_store(unpacked(GOLDEN / "tables/stores" / f"{name}.tar.xz"))])
+    assert len(units.parts) == parts
+    assert units.centimetres == pytest.approx(centimetres, abs=0.01)
 
 
 def test_without_steps_effects_are_in_the_policys_normalised_actions(tmp_path):
