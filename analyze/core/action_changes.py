@@ -146,8 +146,8 @@ def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: b
         BadArgument: an episode holds no actions, they are the same everywhere, or the units do not fit them.
         CorruptEpisode: an episode is damaged.
     """
-    episodes = [(store, episode) for store in stores for episode in _readable(store, skip_corrupt)]
-    actions = [actions_of(store, episode) for store, episode in episodes]
+    episodes = [*readable_episodes(stores, skip_corrupt)]
+    actions = [actions_of(*one) for one in episodes]
     size = actions[0].shape[-1] if actions else 0
     if units:
         return ActionUnits(tuple(parse_units(units, size)))
@@ -168,15 +168,21 @@ def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: b
     return _of_spread(spread)
 
 
-def _readable(store: Store, skip_corrupt: bool) -> Iterator[StoredEpisode]:
-    for episode in store.episodes:
-        try:
-            if episode.attributes.num_replans:
-                actions_of(store, episode)
-                yield episode
-        except CorruptEpisode:
-            if not skip_corrupt:
-                raise
+def readable_episodes(stores: Sequence[Store], skip_corrupt: bool) -> Iterator[tuple[Store, StoredEpisode]]:
+    """All episodes of stores with policy calls, whichever are selected; without the damaged ones if asked."""
+    for store in stores:
+        for episode in store.episodes:
+            try:
+                if not episode.attributes.num_replans:
+                    continue
+                for name in ("actions", "dataset_actions"):
+                    if episode.has(name):
+                        episode.read(name)
+            except CorruptEpisode:
+                if not skip_corrupt:
+                    raise
+                continue
+            yield store, episode
 
 
 def _normalised(scale: Array, ours: bool) -> ActionUnits:

@@ -14,7 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.about import enough, with_interval
-from vla_attention.analyze.core.action_changes import ActionSpread, action_spread
+from vla_attention.analyze.core.action_changes import ActionSpread, action_spread, readable_episodes
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
@@ -204,12 +204,9 @@ def _data_actions(episode: StoredEpisode) -> tuple[Array, NDArray[np.int64]]:
 
 
 def _spread(question: Question) -> ActionSpread:
-    """The units, from all episodes of the stores: they do not change with --task. Damaged episodes are left out."""
-    members = [item.episode for item in question.selected]
-    if not question.settings.skip_corrupt:
-        members = [episode for store in question.stores for episode in store.episodes]
+    """The units, from all episodes of the stores: they do not change with --task."""
     steps = []
-    for episode in members:
+    for _, episode in readable_episodes(question.stores, question.settings.skip_corrupt):
         if episode.has("dataset_actions"):
             actions, counts = _data_actions(episode)
             steps.append(actions[np.arange(actions.shape[1])[None] < counts[:, None]][None])

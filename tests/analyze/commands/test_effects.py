@@ -256,3 +256,11 @@ def test_the_deviation_from_a_data_set_is_that_of_the_raw_arrays(tmp_path):
     whole = result["deviation"].filter(scope="all").row(0, named=True)
     assert (whole["first"], whole["num_episodes"]) == (pytest.approx(np.mean(first)), 6)
     assert result.findings[0].asks == "How far from the data set's actions?"
+
+
+def test_the_units_are_those_of_the_whole_store_with_and_without_damaged_episodes(tmp_path):
+    path = write_site_store(tmp_path / "a.zarr", protocol="dataset", dataset_actions=0.5, replans=6)
+    every = effects(question_about(path))["deviation_replans"]
+    for settings in ({"tasks": (0,)}, {"tasks": (0,), "skip_corrupt": True}):
+        one = effects(question_about(path, **settings))["deviation_replans"]
+        assert_frame_equal(one, every.filter(task_id=0))
