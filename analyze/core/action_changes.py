@@ -8,6 +8,7 @@ names, in the policy's own normalised actions, or, where nobody knows these, in 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -154,11 +155,13 @@ def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: b
     ours = not any(store.attributes.protocol.of_other_loop for store in stores)
     if ours and (found := hand_and_gripper(_commands(episodes))) is not None:
         return found
-    policy = stores[0].attributes.policy
+    policy, data_set = stores[0].attributes.policy, stores[0].attributes.data_set
     if policy.checkpoint_format != CALLERS_MODULES:
         scales = [np.array(of.units) for _, one in episodes if (of := one.attributes.effects) is not None]
         if scales:
-            return _normalised(1 / np.where(scales[0] == 0, 1.0, scales[0]), ours)
+            scale = 1 / np.where(scales[0] == 0, 1.0, scales[0])
+            names = () if data_set is None or len(data_set.action_names) != size else data_set.action_names
+            return ActionUnits(tuple(parts_of_names(names, scale))) if names else _normalised(scale, ours)
     spread = action_spread(actions)
     if not spread.used.any():
         raise BadArgument(
@@ -192,6 +195,20 @@ def _normalised(scale: Array, ours: bool) -> ActionUnits:
     arm = every[:GRIPPER] if ours else every
     parts = [Part(EFFECT, "change (normalised)", said, arm, scale[arm])]
     return ActionUnits((*parts, *([_gripper(len(scale))] if ours else [])))
+
+
+def parts_of_names(names: Sequence[str], scale: Array) -> Iterator[Part]:
+    """Arms and grippers, left and right where the dimensions' names say so, in the policy's normalised actions."""
+    groups: dict[str, list[int]] = {}
+    for number, name in enumerate(names):
+        words = re.split(r"[^a-z]+", name.casefold())
+        side = next((f"{word}_" for word in words if word in ("left", "right")), "")
+        what = "gripper" if any("gripper" in word for word in words) else "arm"
+        groups.setdefault(side + what, []).append(number)
+    for i, (name, members) in enumerate(groups.items()):
+        column, said = f"change_{name}" if i else EFFECT, f"the {name.replace('_', ' ')} changes by {{}} (normalised)"
+        dimensions = np.array(members)
+        yield Part(column, f"{name.replace('_', ' ')} (normalised)", said, dimensions, scale[dimensions])
 
 
 def _of_spread(spread: ActionSpread) -> ActionUnits:

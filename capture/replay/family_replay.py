@@ -133,7 +133,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
         plan.protocol(every),
         recording,
         describe_machine(device) | downloads_of(policy) | plan.data.downloads | decoder_version(),
-        data_set=plan.source(columns_of(robot.cameras, robot.state, robot.actions)),
+        data_set=plan.source(columns_of(robot.cameras, robot.state, robot.actions), robot.actions),
     )
     store = open_run(plan.store, attributes, plan.mode)
     todo = announce_replay(plan, attributes, policy.action_horizon, _picture_sizes(plan.data, policy))

@@ -153,7 +153,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     run.attributes = structs.replace(
         run.attributes,
         protocol=plan.protocol(every),
-        data_set=plan.source(columns_of(cameras, state, actions)),
+        data_set=plan.source(columns_of(cameras, state, actions), actions),
         interventions=interventions_for_store(interventions, run.attributes.interventions),
         rerun_of=None if base is None else RerunSource(run=base[1], name=arguments.rerun_of.name),
     )

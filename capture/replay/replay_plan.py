@@ -29,7 +29,7 @@ from vla_attention.capture.store.store_writer import RunStore, WriteMode, check_
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.options import read_options
 from vla_attention.schemas.progress_bar import progress_bar
-from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.safe_text import file_part, visible
 from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
@@ -72,10 +72,14 @@ class ReplayPlan:
             image_size=0,
         )
 
-    def source(self, columns: Mapping[str, str]) -> DataSetSource:
-        """Return what the store says of the data set; columns: what the policy reads -> column."""
-        info = self.data.info
-        return DataSetSource(self.data.name, info.version, info.fps, info.robot_type, self.data.digest, dict(columns))
+    def source(self, columns: Mapping[str, str], actions: Sequence[str]) -> DataSetSource:
+        """Return what the store says of the data set; columns: what the policy reads -> column. actions: of actions."""
+        info, features = self.data.info, [self.data.feature(name) for name in actions]
+        known = all(len(one.names) == math.prod(one.shape) for one in features)
+        names = [visible(name) for one in features for name in one.names] if known else []
+        return DataSetSource(
+            self.data.name, info.version, info.fps, info.robot_type, self.data.digest, dict(columns), tuple(names)
+        )
 
     def job(self, index: int, every: int) -> EpisodeJob:
         """Return what is to be recorded of an episode. Its task is that of its first frame."""

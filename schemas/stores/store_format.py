@@ -259,6 +259,7 @@ class DataSetSource(Document, frozen=True):
 
     `name`: of its folder, or ORG/NAME of the hub. `version`: of its format. `fps`: frames per second. `digest`: over
     its columns, tasks and episodes. `columns`: which columns the policy's cameras, state and actions are, in words.
+    `action_names`: how the data set calls the dimensions of its actions; empty where it does not.
     """
 
     name: str
@@ -267,10 +268,12 @@ class DataSetSource(Document, frozen=True):
     robot_type: str
     digest: str
     columns: dict[str, str]
+    action_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the texts are text of one line."""
-        for text in (self.name, self.version, self.robot_type, *self.columns, *self.columns.values()):
+        texts = (self.name, self.version, self.robot_type, *self.columns, *self.columns.values(), *self.action_names)
+        for text in texts:
             check_text("data set's text", text)
 
     def describe(self) -> str:

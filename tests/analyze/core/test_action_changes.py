@@ -21,6 +21,7 @@ from vla_attention.analyze.core.action_changes import (
     fitted,
     hand_and_gripper,
     parse_units,
+    parts_of_names,
     rotation_vectors,
     units_of,
 )
@@ -160,6 +161,15 @@ def test_of_the_callers_own_loop_nobody_knows_units_but_the_user(tmp_path):
     assert arms.names == (EFFECT, "change_right")
     assert [one.dimensions.tolist() for one in arms.parts] == [[0, 1], [2]]
     assert arms.said("0.2") == "left changes by 0.2 rad"
+
+
+def test_names_of_a_data_sets_actions_tell_two_arms_apart():
+    names = ["left_waist.pos", "left_elbow.pos", "left_gripper.pos", "right_waist.pos", "right_gripper.pos"]
+    parts = [*parts_of_names(names, np.array([1.0, 2.0, 3.0, 4.0, 5.0]))]
+    assert [part.name for part in parts] == [EFFECT, "change_left_gripper", "change_right_arm", "change_right_gripper"]
+    assert [part.dimensions.tolist() for part in parts] == [[0, 1], [2], [3], [4]]
+    assert [part.scale.tolist() for part in parts] == [[1, 2], [3], [4], [5]]
+    assert [part.dimensions.tolist() for part in parts_of_names(["shoulder", "elbow"], np.ones(2))] == [[0, 1]]
 
 
 @pytest.mark.parametrize(
