@@ -190,7 +190,7 @@ def _needs(part: Compared) -> list[Finding]:
     assert part.units is not None
     said = []
     for row in _largest(rows).iter_rows(named=True):
-        moved_by = part.units.said(f"{2.0 ** row['mean_other']:.2g}")
+        moved_by = part.units.size(2.0 ** row["mean_other"])
         without = "without" if row["kind"] == "without" else "with"
         said.append(f"{without} {row['label']} {moved_by} (against {2.0 ** row['mean_first']:.2g})")
     numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}

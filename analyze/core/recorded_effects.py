@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import (
     EFFECT,
+    ROUNDING,
     ActionUnits,
     BaseEpisode,
     first_angle,
@@ -42,9 +43,6 @@ from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.safe_text import visible
 
-#: Smaller changes are rounding, in any unit: in float32 unchanged calls among those made together stay below it, in
-#: bfloat16 they reach .02 to .05.
-_MOST_ROUNDING = 1e-3
 #: Parts of an episode's time.
 TIME_PARTS = 10
 #: The part of the gripper.
@@ -128,7 +126,7 @@ class RecordedEffects:
 
 def times(effect: str, noise: str) -> pl.Expr:
     """The logarithm of an effect over another one; what is below rounding counts as rounding, so that it is finite."""
-    above, below = (pl.col(name).clip(lower_bound=_MOST_ROUNDING) for name in (effect, noise))
+    above, below = (pl.col(name).clip(lower_bound=ROUNDING) for name in (effect, noise))
     return (above / below).log()
 
 
@@ -388,7 +386,7 @@ def _drift(episodes: Sequence[_Episode], units: ActionUnits) -> tuple[str, ...]:
         if sizes.size and sizes.max() > most:
             most = float(sizes.max())
             where = f"replan {int(arrays['replan'][sizes.argmax()])} of {item.episode.name}"
-    if most <= _MOST_ROUNDING:
+    if most <= ROUNDING:
         return ()
     return (
         f"Calls that were made again without any change differ from the executed ones: "

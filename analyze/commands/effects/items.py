@@ -106,7 +106,8 @@ def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) ->
         return []
     row = _of_exchanges(rows.with_columns(what=pl.lit("any word")), ["what"], question).row(0, named=True)
     words = rows["label"].unique().sort().to_list()
-    said = f"with a word exchanged for another ({listing(words, 2)}) {units.said(with_interval(row, 'effect'))}"
+    size = units.size(row["effect"], with_interval(row, "effect"))
+    said = f"with a word exchanged for another ({listing(words, 2)}) {size}"
     said += "" if row["noise"] is None else f"; with another noise seed {row['noise']:.2g}"
     verdict, limit = {
         MORE: ("It does: ", ""), LESS: ("It does not: ", "")
