@@ -274,7 +274,7 @@ def hand_and_gripper(commands: Sequence[Commands]) -> ActionUnits | None:
     if moves is None or moves.explained < _LEAST_EXPLAINED:
         return None
     said = "the hand ends {} cm elsewhere"
-    parts = [Part(EFFECT, "hand (cm)", said, np.arange(3), np.full(3, 100 * moves.factor), "end")]
+    parts = [Part(EFFECT, "hand elsewhere (cm)", said, np.arange(3), np.full(3, 100 * moves.factor), "end")]
     note = (
         f"A command of 1 for a step moves the hand by {100 * moves.factor:.2f} ± {100 * moves.error:.2f} cm, which "
         f"explains {moves.explained:.0%} of the movements of left-out episodes"
