@@ -116,7 +116,7 @@ def naming(
     found = object_maps(question, heads=False, layers=False, iou=False) if found is None else found
     x = over_place(question, found).filter(kind="object", layer=LAYERS_AVG)
     x = x.select(*EPISODE_ID, "camera", "item", x=(pl.col("at_place") / pl.col("elsewhere")).log())
-    kinds = _by_kind(cases.join(x, on=[*EPISODE_ID, "item"]))
+    kinds = by_kind(cases.join(x, on=[*EPISODE_ID, "item"]))
     return _compared(question, "other tasks", kinds.with_columns(stratum=pl.col("suite")))
 
 
@@ -133,12 +133,12 @@ def _cases(question: Question) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-def _by_kind(rows: pl.DataFrame) -> pl.DataFrame:
+def by_kind(rows: pl.DataFrame) -> pl.DataFrame:
     """The rows, those of a kind as one if an object of the kind is always named: the mean of the named ones, if any."""
     rows = rows.with_columns(kind=pl.col("item").str.replace(r"_\d+$", ""))
     rows = rows.with_columns(always=pl.col("named").all().over("suite", "item"))
-    by_kind = pl.col("always").any().over("suite", "kind")
-    rows = rows.with_columns(item=pl.when(by_kind).then("kind").otherwise("item"))
+    whole = pl.col("always").any().over("suite", "kind")
+    rows = rows.with_columns(item=pl.when(whole).then("kind").otherwise("item"))
     x = pl.when(pl.col("named").any()).then(pl.col("x").filter("named").mean()).otherwise(pl.mean("x"))
     return rows.group_by(*EPISODE_ID, "camera", "item", maintain_order=True).agg(pl.col("named").any(), x)
 

@@ -140,12 +140,13 @@ def _names(one: ObjectMaps) -> list[tuple[str, str]]:
 
 
 def _both(item: SelectedEpisode, one: ObjectMaps, total: Mapping[tuple[str, str], Array]) -> Iterator[pl.DataFrame]:
-    others = np.stack([total[name] for name in _names(one)], axis=-1) - one.area
+    own = one.area.astype(np.float64)
+    others = np.stack([total[name] for name in _names(one)], axis=-1) - own
     cameras = np.repeat(list(one.num_patches), list(one.num_patches.values()))
     for camera in (ALL_CAMERAS, *one.num_patches):
         shown = cameras == camera if camera != ALL_CAMERAS else np.ones(len(cameras), dtype=bool)
         counts = list(one.num_patches.values()) if camera == ALL_CAMERAS else [one.num_patches[camera]]
-        both = [enrichment_on(one.maps[..., shown], area[shown], counts)[None] for area in (one.area, others)]
+        both = [enrichment_on(one.maps[..., shown], area[shown], counts)[None] for area in (own, others)]
         axes: list[Axis] = [{"camera": (camera,)}, {"layer": one.axes[0]["layer"]}, *one.axes[1:]]
         rows = long_table(item, axes, dict(zip(_OVER_PLACE, both, strict=True)))
         yield rows.drop("object_class").drop_nulls(_OVER_PLACE)
