@@ -1,7 +1,7 @@
 """How often the enrichment over its place finds an object that attention follows, and one that it does not.
 
-Made-up first policy calls: pictures of 16 x 16 patches, an object of 2 x 2 patches near the middle that stands elsewhere
-in every episode, and maps that are a blob in the middle with noise. In "own place" the blob's place differs
+Made-up first policy calls: pictures of 16 x 16 patches, an object of 2 x 2 patches near the middle that stands
+elsewhere in every episode, and maps that are a blob in the middle with noise. In "own place" the blob's place differs
 between episodes, independently of the object; in "follows" attention is doubled where the object is.
 
 Usage: python benchmarks/spatial_control.py [--stores 200]

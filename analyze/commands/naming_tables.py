@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import polars as pl
@@ -30,16 +31,27 @@ def of_naming(question: Question, named: Naming) -> Finding | None:
     verdict = "It looks for what the instruction names" if row["ratio"] > 1 else "It looks less at what is named"
     verdict = verdict if shown else "It is not shown to look for what the instruction names"
     if named.form == "same state":
-        said = f"an object gets {_times(row, 'ratio')} as much attention when it is named as when another is, in the "
+        said = f"an object gets {times(row, 'ratio')} as much attention when it is named as when another is, in the "
         said += "same pictures"
     else:
-        said = f"a kind of object gets {_times(row, 'ratio')} as much attention where it is named as in other tasks, "
+        said = f"a kind of object gets {times(row, 'ratio')} as much attention where it is named as in other tasks, "
         said += "beyond what its place explains"
         limits.append(_OWN_SCENES)
     limits += [f"Always named, so nothing is said of it: {listing(named.always)}."] if named.always else []
     numbers = {"form": named.form, "shown": int(shown), **{key: value for key, value in row.items() if key != "camera"}}
     sentence = f"{verdict}: at the first policy call, {said}."
     return Finding(sentence, ASKS, numbers, " ".join(filter(None, limits)))
+
+
+def of_runs(runs: Mapping[str, Sequence[Naming]], named_at: float) -> list[Finding]:
+    """What is named against what is not, of each of several runs by itself; none where nothing shows it."""
+    said, numbers = [], dict[str, float | int | str | None]()
+    for name, row in ((name, one.answer) for name, each in runs.items() for one in each):
+        shown = row["ratio_q"] is not None and row["ratio_q"] <= named_at
+        said.append(f"{name} {times(row, 'ratio')}{'' if shown else ' (nothing is shown)'}")
+        numbers |= {f"{name}_{key}": row[key] for key in ("ratio", "ratio_low", "ratio_high", "ratio_q")}
+    what = "attention to a thing when it is named over when it is not, at the first policy call"
+    return [Finding(f"{listing(said)}: {what}.", "Do they look for what is named?", numbers)] if said else []
 
 
 def of_objects(question: Question, named: Naming, row: dict[str, Any]) -> Finding:
@@ -49,30 +61,31 @@ def of_objects(question: Question, named: Naming, row: dict[str, Any]) -> Findin
     verdict = (
         "It looks at objects, named or not" if low is not None and low > 1 else "It is not shown to look at objects"
     )
-    said = f"at the first policy call they get {_times(row, 'over_area')} the attention that their area would give"
-    said += f", {_times(row, 'over_place')} what their places explain" if place else ""
+    said = f"at the first policy call they get {times(row, 'over_area')} the attention that their area would give"
+    said += f", {times(row, 'over_place')} what their places explain" if place else ""
     why = "no object that one sentence names and another does not is in sight of both"
     why = f"{listing(named.always)}: always named in this suite" if named.always else why
     limit = f"Whether it looks for what is named is not known: {why}. {enough(question)}".strip()
     return Finding(f"{verdict}: {said}.", ASKS, {"shown": 0, **row}, limit)
 
 
-def _times(row: dict[str, Any], name: str) -> str:
+def times(row: Mapping[str, Any], name: str) -> str:
+    """`7.2 times [5.2, 10]`; the value alone without an interval."""
     low, high = row[f"{name}_low"], row[f"{name}_high"]
     return f"{row[name]:.2g} times" + ("" if low is None else f" [{low:.2g}, {high:.2g}]")
 
 
-def tables_of_naming(named: Naming, times: pl.DataFrame) -> tuple[list[Table], list[Table]]:
+def tables_of_naming(named: Naming, later: pl.DataFrame) -> tuple[list[Table], list[Table]]:
     """The numbers of the answer by object and by camera, to stand first; the later policy calls, to stand last."""
     if named.form is None:
         return [], []
     shown = (pl.col("camera") == ALL_CAMERAS) | (pl.col("item") == ALL_NAMED)
-    later = "Policy call by policy call: the hand goes to what is named, and attention follows the hand"
+    title = "Policy call by policy call: the hand goes to what is named, and attention follows the hand"
     first = Table("naming", named.rows, _NAMING, "When named, over when not named", shown)
-    return [first], [Table("naming_course", times, _COURSE, later)]
+    return [first], [Table("naming_course", later, _COURSE, title)]
 
 
-def figures_of_naming(named: Naming, times: pl.DataFrame) -> list[Figure]:
+def figures_of_naming(named: Naming, later: pl.DataFrame) -> list[Figure]:
     """What the sentence quotes, and the later policy calls."""
     if named.form is None:
         return []
@@ -81,7 +94,7 @@ def figures_of_naming(named: Naming, times: pl.DataFrame) -> list[Figure]:
     bars = bars.with_columns(item=pl.when(pl.col("camera") == ALL_CAMERAS).then("item").otherwise(of_camera))
     return [
         Figure("naming", "forest", bars, *_NAMING_SAYS, _NAMING_BARS),
-        Figure("naming_course", "lines", times, *_COURSE_SAYS, _COURSE_LINES),
+        Figure("naming_course", "lines", later, *_COURSE_SAYS, _COURSE_LINES),
     ]
 
 

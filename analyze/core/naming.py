@@ -23,7 +23,7 @@ what is compared and as what it is compared with, so errors come from leaving on
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
@@ -35,7 +35,7 @@ from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.measure import Measured
 from vla_attention.analyze.core.object_maps import ObjectMaps, object_maps, over_place
-from vla_attention.analyze.core.object_shares import ALL_CAMERAS, measure_objects, object_times
+from vla_attention.analyze.core.object_shares import ALL_CAMERAS, cameras_of, measure_objects, object_times
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
@@ -118,6 +118,16 @@ def naming(
     x = x.select(*EPISODE_ID, "camera", "item", x=(pl.col("at_place") / pl.col("elsewhere")).log())
     kinds = by_kind(cases.join(x, on=[*EPISODE_ID, "item"]))
     return _compared(question, "other tasks", kinds.with_columns(stratum=pl.col("suite")))
+
+
+def named_in(question: Question) -> list[Naming]:
+    """`naming` of each suite of any question, where it shows something; none without object coverage."""
+    found = []
+    for suite in dict.fromkeys(store.suite for store in question.stores):
+        selected = tuple(item for item in question.selected if item.store.suite == suite and cameras_of(item))
+        one = naming(replace(question, selected=selected)) if selected else None
+        found += [one] if one is not None and one.form is not None else []
+    return found
 
 
 def _cases(question: Question) -> pl.DataFrame:
