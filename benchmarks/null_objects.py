@@ -262,20 +262,21 @@ def like_libero(suite: str, seed: int) -> tuple[RootAttributes, list[Scene]]:
 
 
 def kinds(store: Path) -> Iterator[tuple[str, Callable[[int, Path], Path]]]:
-    """Name of a kind of stores, and what writes the store of a number to a path."""
+    """Name of a kind of stores, and what writes the store of a number to a path; no two kinds share their noise."""
     root, shared = scenes_of(store)
 
-    def made(scenes: Sequence[Scene], follow: Follow, planted: float = 1.0) -> Callable[[int, Path], Path]:
+    def made(scenes: Sequence[Scene], name: str, planted: float = 1.0) -> Callable[[int, Path], Path]:
+        first = 10_000 * (1 + list(FOLLOWS).index(name) + len(FOLLOWS) * (planted > 1))
         return lambda number, path: write(
-            path, root, scenes, [rows_of(scene, root, follow, number, planted) for scene in scenes]
+            path, root, scenes, [rows_of(scene, root, FOLLOWS[name], first + number, planted) for scene in scenes]
         )
 
     for states, scenes in (("same states", shared), ("other tasks", without_states(shared))):
-        for name, follow in FOLLOWS.items():
-            yield f"{name}, {states}", made(scenes, follow)
+        for name in FOLLOWS:
+            yield f"{name}, {states}", made(scenes, name)
         yield f"thrice, {states}", lambda number, path, scenes=scenes: thrice(root, scenes, number, path)
         for name in ("uniform", "every cube alike"):
-            yield f"PLANTED: named twice, {name}, {states}", made(scenes, FOLLOWS[name], PLANTED)
+            yield f"PLANTED: named twice, {name}, {states}", made(scenes, name, PLANTED)
     for suite in ("spatial", "object"):
         for planted in (1.0, PLANTED):
 
