@@ -9,7 +9,6 @@ import polars as pl
 
 from vla_attention.analyze.core.about import enough
 from vla_attention.analyze.core.naming import ALL_NAMED, Naming
-from vla_attention.analyze.core.object_shares import ALL_CAMERAS
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
@@ -76,12 +75,14 @@ def times(row: Mapping[str, Any], name: str) -> str:
 
 
 def tables_of_naming(named: Naming, later: pl.DataFrame) -> tuple[list[Table], list[Table]]:
-    """The numbers of the answer by object and by camera, to stand first; the later policy calls, to stand last."""
+    """The numbers of the answer by camera, to stand first; the later policy calls, to stand last.
+
+    Files have the first for every object too; of few episodes their intervals are too wide for a screen.
+    """
     if named.form is None:
         return [], []
-    shown = (pl.col("camera") == ALL_CAMERAS) | (pl.col("item") == ALL_NAMED)
     title = "Policy call by policy call: the hand goes to what is named, and attention follows the hand"
-    first = Table("naming", named.rows, _NAMING, "When named, over when not named", shown)
+    first = Table("naming", named.rows, _NAMING, "What is named, over the same when it is not named", _IS_ANSWER)
     return [first], [Table("naming_course", later, _COURSE, title)]
 
 
@@ -89,21 +90,18 @@ def figures_of_naming(named: Naming, later: pl.DataFrame) -> list[Figure]:
     """What the sentence quotes, and the later policy calls."""
     if named.form is None:
         return []
-    bars = named.rows.filter((pl.col("camera") == ALL_CAMERAS) | (pl.col("item") == ALL_NAMED))
-    of_camera = pl.format("{}, {}", "item", "camera")
-    bars = bars.with_columns(item=pl.when(pl.col("camera") == ALL_CAMERAS).then("item").otherwise(of_camera))
     return [
-        Figure("naming", "forest", bars, *_NAMING_SAYS, _NAMING_BARS),
+        Figure("naming", "forest", named.rows.filter(_IS_ANSWER), *_NAMING_SAYS, _NAMING_BARS),
         Figure("naming_course", "lines", later, *_COURSE_SAYS, _COURSE_LINES),
     ]
 
 
+_IS_ANSWER = pl.col("item") == ALL_NAMED
 _NAMING = (
-    Column("item", "text", "object"),
     Column("camera", "text"),
-    Column("ratio", "factor", "named / not", "attention at the first policy call when the object is named over when it "
-           "is not"),
-    Column("ratio_q", "p", "q", "p of 1, adjusted for the number of objects (Benjamini-Hochberg)"),
+    Column("ratio", "factor", "named / not", "attention at the first policy call to an object when it is named, over "
+           "when it is not"),
+    Column("ratio_q", "p", "q", "p of 1"),
     Column("num_episodes", "count", "episodes"),
 )  # fmt: skip
 _COURSE = (
@@ -117,7 +115,7 @@ _NAMING_SAYS = (
     "At the first policy call. Points: geometric means, every task weighing the same; bars: 95% intervals.",
 )
 _NAMING_BARS = {
-    "value": "ratio", "label": "item", "baseline": 1.0, "baseline_name": "as when not named", "log": True,
+    "value": "ratio", "label": "camera", "baseline": 1.0, "baseline_name": "as when not named", "log": True,
     "xlabel": "attention when named / when not (logarithmic)",
 }  # fmt: skip
 _COURSE_SAYS = (
