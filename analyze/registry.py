@@ -72,7 +72,7 @@ COMMANDS: dict[str, Command] = {
         ("words runs/libero_10.zarr", "words runs/libero_10.zarr --task 3", "words runs/cosmos.zarr --by layer"),
     ),
     "objects": Command(
-        "which objects are looked at, over their area and over what their place explains; pointing game and IoU",
+        "does it look for what is named? objects over their area and what their place explains; pointing game and IoU",
         (*_ROWS, "by", "iou"),
         ("image", "latent"),
         _NO_PICTURES,

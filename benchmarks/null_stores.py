@@ -7,13 +7,12 @@ In a null store every key's attention is the same in expectation; tasks, episode
 
     analyze   neither pictures nor text get more attention per token
     words     every word has the same lift in every layer and head
-    objects   attention does not depend on where the objects are
     compare   two runs of the same distribution, paired by initial state
     language  what is done has nothing to do with what is told (rollouts without attention: seconds)
     effects   the action changes as much without each word, part and picture as with another noise seed
 
-A planted store differs in one place: the attention to the pictures, to the word "the", to the first object, or of the
-second run, is higher, by `FACTOR` or a power of it.
+A planted store differs in one place: the attention to the pictures, to the word "the", or of the second run, is higher,
+by `FACTOR` or a power of it. `null_objects.py` has the nulls of `objects`.
 """
 
 from __future__ import annotations
@@ -76,10 +75,6 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
             for piece in tokens.prompts[tokens.prompt_index[0]].pieces:
                 if piece.text.strip() == "the":
                     factor[:, piece.key] = FACTOR**4
-        elif kind == "objects":
-            for span in tokens.layout.spans:
-                if span.camera in (tokens.coverage or {}):
-                    factor[:, span.start : span.stop] += (FACTOR**3 - 1) * tokens.coverage[span.camera][:, :, 0]
         elif kind == "analyze" or seed % 2:  # compare: the second run
             factor = np.where(image, FACTOR, 1.0)
         return normalised(made * (factor[:, None, None, None, None, :] if planted else 1.0))
@@ -103,7 +98,7 @@ SPEC = StoreSpec(
 
 def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool:
     """Whether a sentence of the first screen about one store, or about two, names something; read from its numbers."""
-    spec = replace(SPEC, frames=False, coverage=kind in ("objects", "compare"), mantissa_bits=23, seed=number)
+    spec = replace(SPEC, frames=False, coverage=kind == "compare", mantissa_bits=23, seed=number)
     paths = []
     for run in range(2 if kind == "compare" else 1):
         own = replace(spec, plant_rows=plant_of(kind, 2 * number + run, planted))
@@ -111,9 +106,6 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
     store = va.open(paths[0])
     if kind == "words":
         return "word" in store.words().findings[0].numbers
-    if kind == "objects":
-        q = store.objects(iou=False).findings[0].numbers["over_place_q"]
-        return q is not None and float(q) <= LEVEL
     if kind == "analyze":
         numbers = store.analyze().findings[0].numbers
         return not float(numbers["ratio_lift_low"]) <= 1 <= float(numbers["ratio_lift_high"])
@@ -192,7 +184,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    kinds = ["analyze", "words", "objects", "compare", "language", "effects"]
+    kinds = ["analyze", "words", "compare", "language", "effects"]
     parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"

@@ -1,7 +1,7 @@
 """How often the enrichment over its place finds an object that attention follows, and one that it does not.
 
-Made-up stores: pictures of 16 x 16 patches, an object of 2 x 2 patches near the middle that stands elsewhere in every
-episode and moves a little, and maps that are a blob in the middle with noise. In "own place" the blob's place differs
+Made-up first policy calls: pictures of 16 x 16 patches, an object of 2 x 2 patches near the middle that stands
+elsewhere in every episode, and maps that are a blob in the middle with noise. In "own place" the blob's place differs
 between episodes, independently of the object; in "follows" attention is doubled where the object is.
 
 Usage: python benchmarks/spatial_control.py [--stores 200]
@@ -25,7 +25,7 @@ from vla_attention.analyze.statistics.intervals import (
 )
 from vla_attention.analyze.statistics.units import Units
 
-SIZE, REPLANS = 16, 20
+SIZE = 16
 ROW, COLUMN = np.divmod(np.arange(SIZE**2), SIZE)
 #: Name, episodes of a task, tasks, spread of the blob's place between episodes, how much the object attracts.
 CASES = (
@@ -40,10 +40,10 @@ CASES = (
 )
 
 
-def covered(path: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Areas (replan, patch, 1) of a square of 2 x 2 patches with its centre at `path` (replan, 2)."""
-    sides = [np.clip(1.5 - abs(place + 0.5 - path[:, [axis]]), 0.0, 1.0) for axis, place in enumerate((ROW, COLUMN))]
-    return (sides[0] * sides[1])[..., None].astype(np.float32)
+def covered(centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Areas (patch, 1) of a square of 2 x 2 patches with its centre (2,)."""
+    sides = [np.clip(1.5 - abs(place + 0.5 - centre[axis]), 0.0, 1.0) for axis, place in enumerate((ROW, COLUMN))]
+    return np.asarray(sides[0] * sides[1])[:, None]
 
 
 def intervals_of_store(
@@ -52,19 +52,17 @@ def intervals_of_store(
     """The intervals of the enrichment and of the enrichment over its place."""
     enrichment, elsewhere = [], []
     for _ in range(tasks):
-        means, areas, base = [], [], SIZE / 2 + generator.normal(0, 1.5, 2)
+        maps, areas, base = [], [], SIZE / 2 + generator.normal(0, 1.5, 2)
         for _ in range(episodes):
-            start = np.clip(base + generator.normal(0, 2.0, 2), 2, SIZE - 2)
-            area = covered(start + np.linspace(0, 1, REPLANS)[:, None] * np.clip(generator.normal(0, 1.0, 2), -2, 2))
+            area = covered(np.clip(base + generator.normal(0, 2.0, 2), 2, SIZE - 2))
             middle = (SIZE - 1) / 2 + generator.normal(0, spread, 2)
             blob = 0.2 + np.exp(-((ROW - middle[0]) ** 2 + (COLUMN - middle[1]) ** 2) / 18)
-            maps = blob * np.exp(generator.normal(0, 0.3, (REPLANS, SIZE**2))) * (1 + follow * area[..., 0])
-            maps /= maps.sum(axis=-1, keepdims=True)
-            enrichment.append((maps * area[..., 0]).sum(axis=-1).mean() / area.mean())
-            means.append(maps.mean(axis=0))
-            areas.append(area.mean(axis=0))
+            own = blob * np.exp(generator.normal(0, 0.3, SIZE**2)) * (1 + follow * area[:, 0])
+            maps.append(own / own.sum())
+            areas.append(area)
         total = np.sum(areas, axis=0)
-        pairs = zip(means, areas, strict=True)
+        pairs = list(zip(maps, areas, strict=True))
+        enrichment += [enrichment_on(own, place, [SIZE**2])[0] for own, place in pairs]
         elsewhere += [enrichment_on(own, total - place, [SIZE**2])[0] for own, place in pairs]
     of_task = np.repeat(np.arange(tasks), episodes)
     statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, elsewhere)]

@@ -9,16 +9,11 @@ import polars as pl
 
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, perturbed, tables_of
 from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
+from vla_attention.analyze.commands.naming_tables import of_runs
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
-from vla_attention.analyze.core.compared import (
-    PAIR,
-    Compared,
-    RunValues,
-    by_themselves,
-    compared,
-)
+from vla_attention.analyze.core.compared import PAIR, Compared, RunValues, by_themselves, compared
 from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
@@ -34,8 +29,8 @@ _BETTER, _LISTEN, _MOVED, _NEEDS, _ATTENTION = (
     "Which does better?", "Do they listen?", "How far do the actions move?", "What do the actions depend on?",
     "And the attention?",
 )  # fmt: skip
-#: Differences of five kinds are named: effects, groups, objects, words and heads.
-_SURE = pl.col("difference_q") <= NAMED_AT / 5
+#: Differences of five kinds are named: effects, groups, objects, words and heads; and of each run what it looks for.
+_SURE = pl.col("difference_q") <= NAMED_AT / 6
 _MOST_NAMED = 3  # differences of a kind
 
 
@@ -61,6 +56,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
         if not part.other.run.repeats(first):
             findings += _behaved(part, told[first.name], told[part.name])
         findings += [*_needs(part), _attention(part)]
+    findings += of_runs({one.run.name: one.named for one in (base, *rest)}, NAMED_AT / 6)
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
     about += dict.fromkeys(line for run in runs for line in run.question.told)
     about += [UNTRAINED] if any(run.question.untrained for run in runs) else []

@@ -65,7 +65,7 @@ def perturbed(
         return [], []
     found = []
     for one, pairs in every:
-        suites = by_suite(one.run.question, told[one.run.name], one.values.get("objects"))
+        suites = by_suite(one.run.question, told[one.run.name], one.named)
         num_pairs = [None if pairs is None else pairs.filter(suite=suite).height for suite in suites["suite"]]
         run, of_pairs = pl.lit(one.run.name).alias("run"), pl.Series("pairs", num_pairs, pl.Int64)
         found.append(suites.select(run, pl.all()).with_columns(of_pairs))

@@ -16,7 +16,7 @@ from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.exchanged import exchanged
-from vla_attention.analyze.core.object_shares import object_values
+from vla_attention.analyze.core.naming import named_in
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.measures.question import Question
@@ -76,7 +76,7 @@ def _perturbed(question: Question, asked: pl.DataFrame) -> tuple[list[Finding], 
     """By what LIBERO-PRO changed: success, doing what was told, attention to what the task names; none without it."""
     if not any_perturbed(store.suite for store in question.stores):
         return [], []
-    finding, table = perturbations(by_suite(question, asked, object_values(question)))
+    finding, table = perturbations(by_suite(question, asked, named_in(question)))
     return [finding], [table]
 
 

@@ -1,16 +1,24 @@
-"""Which objects are looked at, and whether that is for the objects or for the places where they stand."""
+"""Does it look for what the instruction names? And which objects are looked at, over their area and their places."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
+from dataclasses import replace
 
 import polars as pl
 
+from vla_attention.analyze.commands.naming_tables import (
+    ASKS,
+    figures_of_naming,
+    of_naming,
+    of_objects,
+    tables_of_naming,
+)
 from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.axes import COLUMNS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.object_maps import enrichment_elsewhere, object_maps
+from vla_attention.analyze.core.naming import at_objects, course, naming
+from vla_attention.analyze.core.object_maps import object_maps, over_place
 from vla_attention.analyze.core.object_shares import (
     CLASSES,
     ITEM,
@@ -36,12 +44,11 @@ _POINTING: dict[str, Scale] = {
     "pointing_chance": "share",
 }  # fmt: skip
 _IOU: dict[str, Scale] = {"iou": "share", "iou_chance": "share"}
-_OVER_PLACE = ("enrichment", "enrichment_elsewhere")
-_ASKS = "What does it look at?"
+_OVER_PLACE = ("at_place", "elsewhere")
 
 
 def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> Result:
-    """Share of the image attention by object and class, over their area and over what their places explain.
+    """What is named against what is not; shares of objects and classes, over their area and what their places explain.
 
     Args:
         question: stores, selection and a site with cameras.
@@ -60,9 +67,9 @@ def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> R
     measured = measure_objects(question, by)
     episodes, values, quotients = object_episodes(measured, by), _SHARES, {}
     if of_maps:
-        place, keys = enrichment_elsewhere(question, found).lazy(), [*EPISODE_ID, "layer", "head", *_OBJECT]
+        place, keys = over_place(question, found).lazy(), [*EPISODE_ID, "layer", "head", *_OBJECT]
         episodes = episodes.join(place, keys, "left", nulls_equal=True, maintain_order="left")
-        values, quotients = {**values, "enrichment_elsewhere": "positive"}, {"over_place": _OVER_PLACE}
+        values, quotients = {**values, **dict.fromkeys(_OVER_PLACE, "positive")}, {"over_place": _OVER_PLACE}
     shown_layer = ~_AVERAGE if of_layers else _AVERAGE
     rows = with_families(episodes.filter(shown_layer).collect(), sampling)
     nulls = dict.fromkeys(quotients, 1.0)
@@ -76,9 +83,16 @@ def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> R
         Table("objects", summary, columns, "Kinds of objects", is_class & together),
         Table("objects_each", summary, columns, "Objects", ~is_class & together & ~_IS_WHOLE_CLASS, of="objects"),
     ]
-    findings = [_finding(question, summary.filter(is_class & together), by)]
     bars = summary.filter(together & ~_IS_WHOLE_CLASS)
     figures = [Figure("objects_enrichment", "forest", bars, *_BARS_SAY, _BARS)]
+    step = f"vla-attention overlay {question.stores[0].path}"
+    rows_of = f"Below, a row for each kind of object and {' and '.join(by)}."
+    findings = [Finding(rows_of, ASKS, {}, enough(question), step)]
+    if not by:
+        named, times = naming(question, measured, found), course(question, measured)
+        finding = of_naming(question, named) or of_objects(question, named, at_objects(question, measured, found))
+        findings, (first, last) = [replace(finding, next_step=step)], tables_of_naming(named, times)
+        tables, figures = [*first, *tables, *last], [*figures_of_naming(named, times), *figures]
     if iou and of_maps:
         pointing, overlaps = (
             frame_of_episodes(found, lambda one: one.pointing), frame_of_episodes(found, lambda one: one.iou)
@@ -94,7 +108,6 @@ def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> R
             Table("pointing_episodes", pointing),
             Table("iou_episodes", overlaps),
         ]
-        findings += [] if by else _of_pointing(pointed)
         bars = regions.filter(shown & ~_IS_WHOLE_CLASS)
         figures.append(Figure("objects_iou", "forest", bars, *_IOU_SAYS, _IOU_BARS))
     tables += [Table("objects_episodes", episodes), *([] if by else [Table("object_times", object_times(measured))])]
@@ -126,7 +139,7 @@ _CAMERA = Column("camera", "text")
 def _columns(known: bool, num_tasks: int) -> list[Column]:
     place = (
         Column("over_place", "factor", "over its place",
-               "attention to the object over the attention, in the same pictures, to where it stands in the task's "
+               "at the first policy call, attention to the object over the attention to where it stands in the task's "
                "other episodes; 1: the place alone explains it, as for an object that hardly moves"),
         Column("over_place_q", "p", "q", "p of 1, adjusted for the number of rows (Benjamini-Hochberg)"),
     )  # fmt: skip
@@ -157,50 +170,6 @@ _OVERLAPS = (
            "over layers"),
     Column("iou_chance", "number", "by chance", "the same with the map moved about the picture"),
 )  # fmt: skip
-
-
-def _finding(question: Question, classes: pl.DataFrame, by: Collection[str]) -> Finding:
-    """How much attention the objects get that the task names, and whether more than their place explains."""
-    step = f"vla-attention overlay {question.stores[0].path}"
-    if by:
-        rows = f"Below, a row for each kind of object and {' and '.join(by)}."
-        return Finding(rows, _ASKS, {}, enough(question), step)
-    of_interest = classes.filter(pl.col("item") == CLASSES[0])
-    if of_interest.is_empty() or of_interest["enrichment"][0] is None:
-        top = classes.drop_nulls("enrichment").sort("enrichment").row(-1, named=True)
-        said = f"For its area, the {top['item']} gets most: {_times(top, 'enrichment')} what its area would give"
-        return Finding(f"{said}. The task names no object that is in sight.", _ASKS, {"estimate": top["enrichment"]},
-                       enough(question), step)  # fmt: skip
-    row = of_interest.row(0, named=True)
-    numbers = {name: row[name] for name in row if name.startswith(("share", "enrichment", "over_place", "num_"))}
-    gets = f"{row['share']:.1%} of the attention to the pictures"
-    if row["over_place"] is None:
-        limit = "No task has two episodes: whether it is for the object or for its place cannot be told."
-        area = f"{_times(row, 'enrichment')} what its area would give"
-        return Finding(f"What the instruction names gets {gets}, {area}.", _ASKS, numbers, limit, step)
-    low = row["over_place_low"]
-    verdict = "What the instruction names: it gets"
-    if not question.untrained and (low is None or low <= 1):
-        verdict = "It is not shown to look for what the instruction names, which gets"
-    said = f"{verdict} {_times(row, 'over_place')} the attention that its place would explain"
-    return Finding(f"{said} ({gets}; {row['enrichment']:.2g} times its share of the area).", _ASKS, numbers,
-                   enough(question), step)  # fmt: skip
-
-
-def _times(row: dict[str, Any], name: str) -> str:
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return f"{row[name]:.2g} times" + ("" if low is None else f" [{low:.2g}, {high:.2g}]")
-
-
-def _of_pointing(pointed: pl.DataFrame) -> list[Finding]:
-    """How often the highest patch is on what the instruction names, by camera."""
-    rows = pointed.filter(item=CLASSES[0], kind="class").drop_nulls("pointing").to_dicts()
-    if not rows:
-        return []
-    said = [f"{row['pointing']:.0%} on {row['camera']} (by chance {row['pointing_chance']:.0%})" for row in rows]
-    numbers = {f"{row['camera']}_{name}": row[name] for row in rows for name in ("pointing", "pointing_chance")}
-    return [Finding(f"The patch with the most attention is on what the instruction names, or beside it, in "
-                    f"{' and '.join(said)} of the layers and calls.", "Does it hit it?", numbers)]  # fmt: skip
 
 
 _BARS_SAY = (

@@ -21,6 +21,7 @@ from vla_attention.analyze.core.courses import strip
 from vla_attention.analyze.core.estimate import Scale, estimate, with_q
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
 from vla_attention.analyze.core.measure import measure, table_of
+from vla_attention.analyze.core.naming import Naming, named_in
 from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
@@ -37,7 +38,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "groups": (("layer", "quantity"), ("layer",)),
     "heads": (("layer", "head"), ()),
     "words": (("item",), ()),
-    "objects": (("kind", "item"), ("kind",)),
+    "objects": (("item",), ()),
     "effects": ((*ITEM, "reader"), ("reader",)),
 }
 #: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
@@ -77,6 +78,11 @@ class RunValues:
         if (objects := object_values(self.run.question)) is not None:
             tables["objects"] = objects
         return tables
+
+    @cached_property
+    def named(self) -> Sequence[Naming]:
+        """What is named against what is not, of each suite in which something shows it."""
+        return named_in(self.run.question)
 
     def _heads(self) -> pl.DataFrame:
         """`EPISODE_ID`, layer (a block), head, value: the part of the attention on one side of the ratio."""

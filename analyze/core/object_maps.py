@@ -1,14 +1,15 @@
 """How well attention maps find objects (pointing game, IoU), and what the same maps get where objects do not stand.
 
 What an object's place explains. Attention that is fixed to the middle of the picture covers an object there better than
-uniform attention does, whatever it is. Objects stand elsewhere in other episodes of the task, so the same maps are put
-on the places that the object has there: a map that does not depend on where the object is gets the same. With M the
-episode's map (mean over replans of the maps of each camera scaled to the sum 1, times W, the camera's share of the
-attention to the pictures), and A(patch) the area that the object covers in the other episodes, mean over these:
+uniform attention does, whatever it is. Objects stand elsewhere in other episodes of the task, so the same map is put on
+the places that the object has there. Both sides are of the first policy call, at which nothing has moved: with M the
+episode's map (those of each camera scaled to the sum 1, times W, the camera's share of the attention to the pictures),
+and A(patch) the area that the object covers in the episode, or its mean over the task's other episodes,
 
-    enrichment elsewhere = sum over patches of M A / sum over cameras of W (mean of A over the camera's patches)
+    at_place, elsewhere = sum over patches of M A / sum over cameras of W (mean of A over the camera's patches)
 
-An object that hardly moves has the same there as at its own place: then the two cannot be told apart.
+A map that does not depend on where the object is gets the same of both, and episodes that are the same one have exactly
+the same. An object that hardly moves between episodes has nearly the same: then the two cannot be told apart.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ MASK_COVERAGE = 0.5
 TOLERANCE = 1.0
 #: Maps of a replan that are compared with masks at once: of two denoise steps of 18 layers, or of as many heads.
 _MAPS_TOGETHER = 36
+_OVER_PLACE = ("at_place", "elsewhere")
 #: Less area than this is none: what is left of a sum from which another was taken.
 _NO_AREA = 1e-9
 
@@ -78,7 +80,7 @@ class ObjectMaps:
         iou: the same rows once for each `threshold` (p80, p90, p95): iou, and iou_chance, the mean IoU with the mask
             moved about the picture. Empty as above.
         maps: M above of all cameras, (layer or 1, head or 1, patch); patches of each camera as in `num_patches`.
-        area: covered share of the patches, mean over replans, (patch, item).
+        area: covered share of the patches at the first call, (patch, item).
         axes: labels of the layers, the heads and the items.
     """
 
@@ -105,11 +107,11 @@ def object_maps(question: Question, heads: bool, layers: bool, iou: bool) -> Seq
         return OnDisk(each_episode(read, (item.fresh() for item in question.selected), advance))
 
 
-def enrichment_elsewhere(question: Question, found: Sequence[ObjectMaps]) -> pl.DataFrame:
-    """The enrichment of each episode's maps where its objects stand in the other episodes of the task.
+def over_place(question: Question, found: Sequence[ObjectMaps]) -> pl.DataFrame:
+    """The enrichment of each episode's first map where its objects stand, and where they do in the other episodes.
 
     Returns:
-        One row per (episode, layer[, head], camera or all together, item) of which there is one: enrichment_elsewhere.
+        One row per (episode, layer[, head], camera or all together, item) of which there are both: at_place, elsewhere.
     """
     parts = []
     for positions in positions_by_task(question.selected).values():
@@ -118,11 +120,10 @@ def enrichment_elsewhere(question: Question, found: Sequence[ObjectMaps]) -> pl.
             continue
         total = _sum_by_item(members)
         for i, one in zip(positions, members, strict=True):
-            parts += list(_elsewhere(question.selected[i], one, total))
-    schema = dict.fromkeys(("suite", "layer", *ITEM[:3]), pl.String)
-    empty = pl.DataFrame(schema={**schema, "task_id": pl.Int64, "episode_index": pl.Int64, "head": pl.Int64,
-                                 "enrichment_elsewhere": pl.Float64})  # fmt: skip
-    return pl.concat(parts) if parts else empty
+            parts += list(_both(question.selected[i], one, total))
+    schema = {**dict.fromkeys(("suite", "layer", *ITEM[:3]), pl.String), **dict.fromkeys(("task_id", "episode_index",
+              "head"), pl.Int64), **dict.fromkeys(_OVER_PLACE, pl.Float64)}  # fmt: skip
+    return pl.concat(parts) if parts else pl.DataFrame(schema=schema)
 
 
 def _sum_by_item(members: Sequence[ObjectMaps]) -> dict[tuple[str, str], Array]:
@@ -138,19 +139,17 @@ def _names(one: ObjectMaps) -> list[tuple[str, str]]:
     return list(zip(one.axes[2]["kind"], one.axes[2]["item"], strict=True))
 
 
-def _elsewhere(
-    item: SelectedEpisode, one: ObjectMaps, total: Mapping[tuple[str, str], Array]
-) -> Iterator[pl.DataFrame]:
-    others = np.stack([total[name] for name in _names(one)], axis=-1) - one.area
+def _both(item: SelectedEpisode, one: ObjectMaps, total: Mapping[tuple[str, str], Array]) -> Iterator[pl.DataFrame]:
+    own = one.area.astype(np.float64)
+    others = np.stack([total[name] for name in _names(one)], axis=-1) - own
     cameras = np.repeat(list(one.num_patches), list(one.num_patches.values()))
     for camera in (ALL_CAMERAS, *one.num_patches):
         shown = cameras == camera if camera != ALL_CAMERAS else np.ones(len(cameras), dtype=bool)
         counts = list(one.num_patches.values()) if camera == ALL_CAMERAS else [one.num_patches[camera]]
-        values = enrichment_on(one.maps[..., shown], others[shown], counts)
-        values = np.where(one.area[shown].any(axis=0), values, np.nan)
+        both = [enrichment_on(one.maps[..., shown], area[shown], counts)[None] for area in (own, others)]
         axes: list[Axis] = [{"camera": (camera,)}, {"layer": one.axes[0]["layer"]}, *one.axes[1:]]
-        rows = long_table(item, axes, {"enrichment_elsewhere": values[None]})
-        yield rows.drop("object_class").filter(pl.col("enrichment_elsewhere").is_not_null())
+        rows = long_table(item, axes, dict(zip(_OVER_PLACE, both, strict=True)))
+        yield rows.drop("object_class").drop_nulls(_OVER_PLACE)
 
 
 def enrichment_on(maps: NDArray[np.floating], area: NDArray[np.floating], num_patches: Sequence[int]) -> Array:
@@ -216,18 +215,15 @@ def _of_episode(item: SelectedEpisode, selection: Selection, site: str, layers: 
         thresholds: Axis = {"threshold": [f"p{percentile:g}" for percentile in PERCENTILES]}
         overlaps.append(long_table(item, [*axes, thresholds, items], of_regions, EPISODE_KEYS))
     place = slice(None, -1) if layers else slice(-1, None)
-    means = [with_average(array.mean(axis=2, dtype=np.float64), selection)[:, place] for array in maps.values()]
+    means = [with_average(array[:1].mean(axis=2, dtype=np.float64), selection)[0, place] for array in maps.values()]
     of_camera = [array.sum(axis=-1, keepdims=True) for array in means]
     with np.errstate(invalid="ignore", divide="ignore"):
-        whole = [
-            finite_mean(own / mass) * finite_mean(mass / sum(of_camera))
-            for own, mass in zip(means, of_camera, strict=True)
-        ]
+        whole = [array / sum(of_camera) for array in means]
     return ObjectMaps(
         pl.concat(pointing) if pointing else pl.DataFrame(),
         pl.concat(overlaps) if overlaps else pl.DataFrame(),
         np.concatenate(whole, axis=-1).astype(np.float32),
-        np.concatenate([view.area.mean(axis=0) for view in views.values()]),
+        np.concatenate([view.area[0] for view in views.values()]),
         {camera: len(view.picture.keys) for camera, view in views.items()},
         ({name: list(labels)[place] for name, labels in of_layers.items()}, heads_axis, items),
     )

@@ -145,15 +145,16 @@ def object_episodes(measured: Sequence[Measured], by: Collection[str] = ()) -> p
 
 
 def object_values(question: Question) -> pl.DataFrame | None:
-    """Log2 of the attention to every class and object over what its area gives it; None without object coverage.
+    """Log2 of the attention to every object over what its area gives it; None without object coverage.
 
     Returns:
-        suite, task_id, episode_index, kind, item, value: of all cameras together, mean over layers.
+        suite, task_id, episode_index, item, value: of all cameras together, mean over layers and policy calls.
     """
     if not any(cameras_of(item) for item in question.selected):
         return None
-    rows = object_episodes(measure_objects(with_coverage(question))).filter(camera=ALL_CAMERAS, layer=LAYERS_AVG)
-    return rows.select(*EPISODE_ID, "kind", "item", value=pl.col("enrichment").log(2.0)).collect()
+    rows = object_episodes(measure_objects(with_coverage(question)))
+    rows = rows.filter(camera=ALL_CAMERAS, layer=LAYERS_AVG, kind="object")
+    return rows.select(*EPISODE_ID, "item", value=pl.col("enrichment").log(2.0)).collect()
 
 
 def _of_replans(rows: pl.DataFrame) -> pl.DataFrame:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import polars as pl
 
-from vla_attention.analyze.core.object_shares import CLASSES
+from vla_attention.analyze.core.naming import Naming
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
@@ -19,7 +19,7 @@ _SUITE = re.compile(rf"libero_pro_.+_({'|'.join(_CHANGED)})")
 _SAID = {
     "solved": "{:.0%} solved",
     "did": "{:.0%} did as told",
-    "named": "what is named gets {:.2g} times its area's share of the attention",
+    "named": "what is named gets {:.2g} times as much attention as where it is not named",
 }
 _COLUMNS = [
     Column("kind", "text", "changed"),
@@ -27,7 +27,12 @@ _COLUMNS = [
     Column("suite", "text"),
     Column("solved", "percent"),
     Column("did", "percent", "did as told"),
-    Column("named", "factor", "on what it names", "attention to the objects that the task names, over their area's"),
+    Column(
+        "named",
+        "factor",
+        "named / not",
+        "attention to what is named, over that to the same thing where it is not, at the first policy call",
+    ),
     Column("num_episodes", "count", "episodes"),
     Column("pairs", "count", "pairs", "with the first run, from the same initial states; 0: not paired"),
 ]
@@ -38,27 +43,25 @@ def any_perturbed(suites: Iterable[str]) -> bool:
     return any(_SUITE.fullmatch(suite) for suite in suites)
 
 
-def by_suite(question: Question, asked: pl.DataFrame, objects: pl.DataFrame | None) -> pl.DataFrame:
+def by_suite(question: Question, asked: pl.DataFrame, named: Sequence[Naming]) -> pl.DataFrame:
     """A row a suite: kind (what was changed), suite, solved, did, named, num_episodes. Every task weighs the same.
 
     Args:
         question: its selected episodes.
         asked: of `behaviour`: what was told and done.
-        objects: of `object_values`; None: not known.
+        named: of `naming.named_in`; a suite of which nothing shows it has none.
     """
     schema = {**dict(zip(EPISODE_ID, (pl.String, pl.Int64, pl.Int64), strict=True)), "solved": pl.Float64}
     rows = pl.DataFrame([(*one.key, one.episode.attributes.success) for one in question.selected], schema, orient="row")
     rows = rows.join(asked.select(*EPISODE_ID, did=pl.col("as_told").cast(pl.Float64)), on=EPISODE_ID, how="left")
-    if objects is None:
-        rows = rows.with_columns(named=pl.lit(None, pl.Float64))
-    else:
-        named = objects.filter(kind="class", item=CLASSES[0]).select(*EPISODE_ID, named="value")
-        rows = rows.join(named, on=EPISODE_ID, how="left")
+    logs = [one.episodes.select(*EPISODE_ID, named="log_ratio") for one in named]
+    none = rows.clear().select(*EPISODE_ID, named=pl.lit(None, pl.Float64))
+    rows = rows.join(pl.concat([none, *logs]), on=EPISODE_ID, how="left")
     means = [pl.mean("solved", "did", "named")]
     tasks = rows.group_by("suite", "task_id").agg(pl.len().alias("num_episodes"), *means)
     suites = tasks.group_by("suite").agg(pl.sum("num_episodes"), *means).sort("suite")
     kinds = [_CHANGED[found[1]] if (found := _SUITE.fullmatch(suite)) else "nothing" for suite in suites["suite"]]
-    return suites.with_columns(named=2.0 ** pl.col("named"), kind=pl.Series(kinds, dtype=pl.String))
+    return suites.with_columns(named=pl.col("named").exp(), kind=pl.Series(kinds, dtype=pl.String))
 
 
 def perturbations(table: pl.DataFrame) -> tuple[Finding, Table]:

@@ -174,8 +174,8 @@ def test_what_libero_pro_changed_is_told_apart_and_paired_where_states_are_share
     kept = ["kind", "suite", "num_episodes", "solved", "did"]
     assert told.select(kept).equals(found["perturbations"].select(kept))
     assert told["did"].to_list() == told["solved"].to_list() == [share, share]
-    assert told["named"].null_count() == 0
-    assert told["named"].to_list() == pytest.approx(found["perturbations"]["named"].to_list())
+    # All of these tasks name the same things, so nothing shows what naming does.
+    assert told["named"].null_count() == found["perturbations"]["named"].null_count() == told.height
     # Without an interval anywhere, and without LIBERO-PRO.
     found = compare(opened(stores, "few", "few_object", allowed=("suite",)), ("suite",))
     assert "perturbations" not in [table.name for table in found.tables]

@@ -208,5 +208,5 @@ def test_other_words_for_the_told_goal_count_as_done():
         unknown = SimpleNamespace(attributes=SimpleNamespace(success=None))
         keys = asked.select("suite", "task_id", "episode_index").rows()
         question = SimpleNamespace(selected=[SimpleNamespace(key=key, episode=unknown) for key in keys])
-        assert by_suite(question, asked, None)["did"].to_list() == [0.5]
+        assert by_suite(question, asked, [])["did"].to_list() == [0.5]
         assert listens(with_choices(asked)).numbers == {"right": 1, "n": 2}

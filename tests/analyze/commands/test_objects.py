@@ -116,7 +116,7 @@ def test_enrichment_of_all_cameras_is_a_mean_of_the_cameras(follower_store):
     table = measured(follower_store, iou=False)["objects_episodes"]
     keys = ["task_id", "episode_index", "layer", "kind", "item"]
     of_camera = table.filter(pl.col("camera") != "all").group_by(keys)
-    for name in ("enrichment", "enrichment_elsewhere"):
+    for name in ("enrichment", "at_place", "elsewhere"):
         bounds = of_camera.agg(pl.col(name).min().alias("low"), pl.col(name).max().alias("high"))
         both = table.filter(pl.col("camera") == "all").join(bounds, on=keys).drop_nulls([name, "low"])
         assert both.height > 0
@@ -214,10 +214,20 @@ def test_what_is_planted_is_found_where_it_is(follower_store):
     assert cabinet["enrichment_high"][0] < shares["enrichment_low"][0]
 
 
-def test_an_object_that_does_not_move_has_nothing_over_its_place_and_a_followed_one_has(follower_store):
-    table = measured(follower_store, iou=False)["objects"].filter(camera="all")
+def test_an_object_that_does_not_move_has_nothing_over_its_place_and_a_followed_one_has(tmp_path):
+    def places(task, episode, tokens):
+        area = bowl_coverage(tokens.num_replans, 16)
+        for own in area.values():  # the bowl is elsewhere in each episode
+            grid = own.reshape(len(own), 16, 16, -1)
+            grid[..., 4] += grid[..., 0]
+            grid[..., 0] = np.roll(grid[..., 0], (2 * episode, 3 * task), axis=(1, 2))
+            grid[..., 4] -= grid[..., 0]
+        return area
+
+    path = write_bowl_store(tmp_path / "a.zarr", plant_rows=follow_bowl, plant_coverage=places, episodes=3)
+    table = measured(path, iou=False)["objects"].filter(camera="all")
     assert table.filter(item="wooden_cabinet_1")["over_place"][0] == pytest.approx(1.0, abs=1e-5)
-    assert table.filter(BOWL)["over_place_low"][0] > 1.4  # it moves within an episode
+    assert table.filter(BOWL)["over_place_low"][0] > 1.4
 
 
 def test_a_map_that_is_fixed_to_a_place_has_nothing_over_it_and_one_that_follows_has():
@@ -303,7 +313,7 @@ def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
         *(f"objects_{name}.{kind}" for name in ("enrichment", "iou") for kind in ("png", "pdf")),
     }  # fmt: skip
     numbers = json.loads((tmp_path / "result.json").read_text())["findings"][0]["numbers"]
-    assert numbers["enrichment_low"] < numbers["enrichment"] < numbers["enrichment_high"]
+    assert numbers["over_area_low"] < numbers["over_area"] < numbers["over_area_high"]
 
 
 def test_a_mistake_is_named(follower_store, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""What maps get where objects stand in other episodes, against loops over raw Zarr arrays."""
+"""What first maps get where objects stand, here and in other episodes, against loops over raw Zarr arrays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import zarr
 
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
 from tests.kit.questions import question_about
-from vla_attention.analyze.core.object_maps import enrichment_elsewhere, object_maps
+from tests.kit.tokens import random_rows
+from vla_attention.analyze.core.object_maps import object_maps, over_place
 
 SIZE, REPLANS, EPISODES = 7, 2, (0, 1, 2)
 
@@ -53,28 +54,25 @@ def raw(store: Path, task: int, episode: int) -> tuple[dict[str, np.ndarray], di
     return {c: rows[..., keys[c]] for c in CAMERAS}, {c: group[f"objects/{c}"][:].astype(float) for c in CAMERAS}
 
 
-def expected(arrays: dict, episode: int, layer: int, head: int, cameras: tuple[str, ...], thing: int) -> float:
-    """A loop over cameras, patches and the other episodes of the task."""
-    rows, _ = arrays[episode]
-    rows = {camera: of[:, layer, :, head].mean(axis=1) for camera, of in rows.items()}  # (replan, patch)
-    on, even = 0.0, 0.0
-    for camera in cameras:
-        share, scaled = [], []
-        for replan in range(REPLANS):
-            own = rows[camera][replan]
-            share.append(own.sum() / sum(rows[other][replan].sum() for other in CAMERAS))
-            scaled.append(own / own.sum())
-        of_map = np.mean(scaled, axis=0) * np.mean(share)
-        others = [arrays[other][1][camera][..., thing].mean(axis=0) for other in EPISODES if other != episode]
-        area = np.mean(others, axis=0)
-        on += sum(of_map[patch] * area[patch] for patch in range(SIZE * SIZE))
-        even += np.mean(share) * area.mean()
-    return on / even
+def expected(arrays: dict, episode: int, layer: int, head: int, cameras: tuple[str, ...], thing: int) -> list[float]:
+    """At the first call, by a loop over cameras and patches: in the episode, and in the other episodes of the task."""
+    first = {camera: of[0, layer, :, head].mean(axis=0) for camera, of in arrays[episode][0].items()}
+    others = [other for other in EPISODES if other != episode]
+    found = []
+    for shown in ([episode], others):
+        on, even = 0.0, 0.0
+        for camera in cameras:
+            share = first[camera].sum() / sum(first[other].sum() for other in CAMERAS)
+            area = np.mean([arrays[other][1][camera][0, :, thing] for other in shown], axis=0)
+            on += sum(share * first[camera][patch] / first[camera].sum() * area[patch] for patch in range(SIZE * SIZE))
+            even += share * area.mean()
+        found.append(on / even)
+    return found
 
 
 def test_it_is_what_the_maps_get_at_the_places_of_the_other_episodes(store):
     question = question_about(store)
-    table = enrichment_elsewhere(question, object_maps(question, heads=True, layers=True, iou=False))
+    table = over_place(question, object_maps(question, heads=True, layers=True, iou=False))
     arrays = {task: [raw(store, task, episode) for episode in EPISODES] for task in (0, 1)}
     things = [thing.name for thing in question.selected[0].tokens.objects]
     own = table.filter(kind="object").filter(pl.col("layer") != "layers_avg")
@@ -84,6 +82,17 @@ def test_it_is_what_the_maps_get_at_the_places_of_the_other_episodes(store):
     for row in own.iter_rows(named=True):
         cameras = CAMERAS if row["camera"] == "all" else (row["camera"],)
         at = (row["episode_index"], (0, 2).index(int(row["layer"])), row["head"])
-        assert row["enrichment_elsewhere"] == pytest.approx(
-            expected(arrays[row["task_id"]], *at, cameras, things.index(row["item"])), rel=1e-5
-        ), row
+        wanted = expected(arrays[row["task_id"]], *at, cameras, things.index(row["item"]))
+        assert [row["at_place"], row["elsewhere"]] == pytest.approx(wanted, rel=1e-5), row
+
+
+def test_the_same_episode_three_times_has_exactly_its_place(tmp_path):
+    def plant(task, episode, tokens, rows):
+        rows = random_rows(tokens, rows.shape[1:-1], seed=task, spread=1.0)
+        return rows / rows.sum(axis=-1, keepdims=True)
+
+    path = write_bowl_store(tmp_path / "a.zarr", tokens=bowl_tokens(REPLANS, SIZE), episodes=3, plant_rows=plant)
+    question = question_about(path)
+    table = over_place(question, object_maps(question, heads=False, layers=False, iou=False))
+    assert table.height > 0
+    assert (table["at_place"] == table["elsewhere"]).all()

@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 import pytest
 
-from vla_attention.analyze.core.object_shares import CLASSES
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite
 
 SUITES = {"libero_goal": "nothing", "libero_pro_goal_lan": "the sentence", "libero_pro_goal_swap": "places"}
@@ -30,26 +29,24 @@ def test_every_task_weighs_the_same():
     )
     names = ["suite", "task_id", "episode_index"]
     asked = pl.DataFrame([(*key, value) for key, value in did.items()], [*names, "as_told"], orient="row")
-    # What other classes and single objects get is another matter.
-    items = [("class", CLASSES[0], 0.0), ("class", CLASSES[1], 9.0), ("object", CLASSES[0], -9.0)]
-    objects = pl.DataFrame(
-        [(*key, kind, item, value + more) for key, value in named.items() for kind, item, more in items],
-        [*names, "kind", "item", "value"],
-        orient="row",
-    )
+    parts = {suite: [(*key, value) for key, value in named.items() if key[0] == suite] for suite in SUITES}
+    shown = [
+        SimpleNamespace(episodes=pl.DataFrame(of_suite, [*names, "log_ratio"], orient="row"))
+        for of_suite in parts.values()
+    ]
 
     def over_tasks(suite: str, values: dict) -> float:
         of_task = [[value for key, value in values.items() if key[:2] == (suite, task)] for task in range(3)]
         return float(np.mean([np.mean(of) for of in of_task]))
 
-    rows = by_suite(question, asked, objects).rows_by_key("suite", named=True, unique=True)
+    rows = by_suite(question, asked, shown).rows_by_key("suite", named=True, unique=True)
     assert {suite: row["kind"] for suite, row in rows.items()} == SUITES
     for suite, row in rows.items():
         assert row["num_episodes"] == sum(EPISODES)
         assert row["solved"] == pytest.approx(over_tasks(suite, solved))
         assert row["did"] == pytest.approx(over_tasks(suite, did))
-        assert row["named"] == pytest.approx(2 ** over_tasks(suite, named))
-    assert by_suite(question, asked, None)["named"].null_count() == len(SUITES)
+        assert row["named"] == pytest.approx(np.exp(over_tasks(suite, named)))
+    assert by_suite(question, asked, [])["named"].null_count() == len(SUITES)
 
 
 def test_what_libero_pro_changed_is_the_end_of_a_whole_name():
