@@ -36,9 +36,9 @@ from tests.kit.made_up_behaviour import STEPS, did, goals_of
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.commands.effects.answer import deciding
 from vla_attention.analyze.commands.effects.items import by_item
-from vla_attention.analyze.commands.language import SHOWN_AT, listens
 from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.core.behaviour import with_choices
+from vla_attention.analyze.core.listening import IN_PART, LISTENS_TO_ALL, SHOWN_AT, listens
 from vla_attention.analyze.core.recorded_effects import summary_of
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -151,6 +151,67 @@ def says_it_listens(sets: int, planted: bool) -> float:
     return said / sets
 
 
+COLOURS = ("red", "green", "blue")
+SENTENCES = [*(f"touch the {colour} cube" for colour in COLOURS), *(f"lift the {colour} cube" for colour in COLOURS)]
+TOUCH, LIFT = "touch the COLOUR cube", "lift the COLOUR cube"
+#: Policies that hear a part of what they are told, or all of it in most episodes.
+PARTLY_DEAF = ("pictures", "deaf to lift", "hears red", "obeys mostly")
+
+
+def of_a_listener(policy: str, sets: int) -> dict[str, float]:
+    """How often `language` is wrong about a policy that hears a part of what it is told, and how often it says which.
+
+    pictures      does what the picture says: half of the states belong to one task each, the rest to all
+    deaf to lift  touches what it is told to, and lifts what it likes in that state
+    hears red     goes to red when told so, else to green in every second set, to green or blue in the others
+    obeys mostly  does what it is told in 80 % of all episodes, else goes where it likes in that state
+
+    Returns:
+        wrong: "it listens" without saying to what, or what is not heard said to be heard, or what is heard not to be.
+        found: what is heard is named, and nothing else; of a policy that is deaf to a kind of sentence also that.
+    """
+    wrong = found = 0
+    for number in range(sets):
+        numbers = listens(with_choices(rollouts_of(policy, np.random.default_rng(number)))).numbers
+        heard, deaf = (str(numbers.get(name, "")).split(", ") for name in ("heard", "not_heard"))
+        says = numbers["verdict"]
+        if policy == "pictures":
+            wrong += says in (LISTENS_TO_ALL, IN_PART)
+        elif policy == "deaf to lift":
+            wrong += says == LISTENS_TO_ALL or LIFT in heard or TOUCH in deaf
+            found += TOUCH in heard and LIFT in deaf
+        elif policy == "hears red":
+            wrong += says == LISTENS_TO_ALL or "green" in heard or "blue" in heard or "red" in deaf
+            found += heard == ["red"]
+        else:
+            wrong += deaf != [""]
+            found += says == LISTENS_TO_ALL
+    return {"wrong": wrong / sets, "found": found / sets}
+
+
+def rollouts_of(policy: str, generator: np.random.Generator) -> pl.DataFrame:
+    """The rows of `behaviour` of 4 to 12 initial states, in each of which every task is told."""
+    tasks = range(6 if policy == "deaf to lift" else 3)
+    goals, frames = goals_of({task: SENTENCES[task] for task in tasks}), []
+    always_green = generator.random() < 0.5
+    families = {task: TOUCH if task < 3 else LIFT for task in tasks}
+    for state in range(generator.integers(4, 13)):
+        likes, rollouts = int(generator.integers(3)), []
+        alone = policy == "pictures" and state % 2
+        for task in [likes] * 3 if alone else tasks:
+            kind, colour = task // 3, task % 3
+            obeys = {
+                "pictures": False,
+                "deaf to lift": kind == 0,
+                "hears red": colour == 0,
+                "obeys mostly": generator.random() < 0.8,
+            }[policy]
+            free = likes if policy != "hears red" else 1 if always_green else 1 + int(generator.integers(2))
+            rollouts.append((task, {3 * kind + (colour if obeys else free): 5}))
+        frames.append(did(rollouts, goals, families, state=str(state)))
+    return pl.concat(frames).with_columns(episode_index=pl.int_range(pl.len()))
+
+
 def names_a_word(sets: int, planted: float) -> float:
     """The share of sets of recorded effects of which `effects` says that a word is shown to exceed another noise seed.
 
@@ -196,6 +257,9 @@ def main() -> None:
         if kind == "language":
             share = says_it_listens(arguments.stores, arguments.planted)
             print(f"  {kind:8} says that it listens in {share:.1%}", flush=True)
+            for policy in PARTLY_DEAF:
+                rates = of_a_listener(policy, arguments.stores)
+                print(f"  {kind:8} {policy}: wrong in {rates['wrong']:.1%}, told in {rates['found']:.1%}", flush=True)
             continue
         if kind == "effects":
             share = names_a_word(arguments.stores, 0.8 * arguments.planted)

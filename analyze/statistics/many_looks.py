@@ -30,3 +30,11 @@ def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
     for place, q in zip(order, adjusted, strict=True):
         by_place[known[place]] = float(q)
     return by_place
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's adjusted p-values (1979, Scandinavian Journal of Statistics 6): of all claims, none is false in 95 %."""
+    order, adjusted, least = sorted(range(len(p_values)), key=p_values.__getitem__), [1.0] * len(p_values), 0.0
+    for rank, place in enumerate(order):
+        least = adjusted[place] = max(least, min(1.0, (len(order) - rank) * p_values[place]))
+    return adjusted
