@@ -10,6 +10,7 @@ In a null store every key's attention is the same in expectation; tasks, episode
     objects   attention does not depend on where the objects are
     compare   two runs of the same distribution, paired by initial state
     language  what is done has nothing to do with what is told (rollouts without attention: seconds)
+    language_test  policies whose actions scatter, drift or round, whatever they are told (calls: seconds)
     effects   the action changes as much without each word as with another noise seed (tables: seconds)
 
 A planted store differs in one place: the attention to the pictures, to the word "the", to the first object, or of the
@@ -19,6 +20,8 @@ second run, is higher, by `FACTOR` or a power of it.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import sys
 import tempfile
 from collections.abc import Callable
@@ -212,6 +215,37 @@ def rollouts_of(policy: str, generator: np.random.Generator) -> pl.DataFrame:
     return pl.concat(frames).with_columns(episode_index=pl.int_range(pl.len()))
 
 
+#: Policies to which words do nothing, by name and number of kinds of other sentences.
+NOTHING_HEARD = [*(("noise", kinds) for kinds in (1, 6, 20)), ("drift", 6), ("walk", 6), ("rounding", 6)]
+
+
+def says_it_hears(policy: str, kinds: int, sets: int, planted: float = 0.0, inputs: int = 8) -> float:
+    """The share of sets of calls of which `va.language_test` says that the policy hears.
+
+    noise     every call draws noise of its own, as wide as the inputs differ
+    drift     little noise, and every call moves on by as much as the inputs differ
+    walk      every call moves on by a step that is drawn
+    rounding  no noise; every sentence gives other last digits (1e-5)
+
+    planted: by how much the first kind of sentence moves the action, in units of how far the inputs differ.
+    """
+    said = 0
+    for number in range(sets):
+        generator, state = np.random.default_rng([number, kinds]), {"at": 0.0}
+
+        def call(place: float, told: str, draw: np.random.Generator = generator, at: dict[str, float] = state) -> Rows:
+            noise = {"noise": 1.0, "drift": 0.1, "walk": 0.1}.get(policy, 0.0)
+            at["at"] += {"drift": 1.0, "walk": draw.normal()}.get(policy, 0.0)
+            plan = np.full((4, 7), place + at["at"]) + noise * draw.normal(size=(4, 7))
+            return plan * (1 + 1e-5 * (policy == "rounding") * len(told)) + planted * (told == "kind 0")
+
+        given = [(place, "own") for place in generator.normal(size=inputs).tolist()]
+        with contextlib.redirect_stdout(io.StringIO()):
+            found = va.language_test(call, given, [f"kind {'x' * kind}" if kind else "kind 0" for kind in range(kinds)])
+        said += bool(found.findings[-1].numbers.get("hears"))
+    return said / sets
+
+
 def names_a_word(sets: int, planted: float) -> float:
     """The share of sets of recorded effects of which `effects` says that a word is shown to exceed another noise seed.
 
@@ -248,7 +282,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    kinds = ["analyze", "words", "objects", "compare", "language", "effects"]
+    kinds = ["analyze", "words", "objects", "compare", "language", "language_test", "effects"]
     parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"
@@ -260,6 +294,13 @@ def main() -> None:
             for policy in PARTLY_DEAF:
                 rates = of_a_listener(policy, arguments.stores)
                 print(f"  {kind:8} {policy}: wrong in {rates['wrong']:.1%}, told in {rates['found']:.1%}", flush=True)
+            continue
+        if kind == "language_test":
+            for policy, kinds_told in (
+                [("noise", 1), ("noise", 6), ("noise", 20)] if arguments.planted else NOTHING_HEARD
+            ):
+                share = says_it_hears(policy, kinds_told, arguments.stores, 1.0 * arguments.planted)
+                print(f"  {kind:8} {policy}, {kinds_told} kinds: says that it hears in {share:.1%}", flush=True)
             continue
         if kind == "effects":
             share = names_a_word(arguments.stores, 0.8 * arguments.planted)
