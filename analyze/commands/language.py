@@ -16,7 +16,7 @@ from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.exchanged import exchanged
-from vla_attention.analyze.core.listening import LISTENS, SHOWN_AT, listens, table_of_parts
+from vla_attention.analyze.core.listening import LISTENS, listens, table_of_parts
 from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
@@ -47,8 +47,7 @@ def language(question: Question) -> Result:
     by_change, changes = _perturbed(question, asked)
     reached = words_get_through(question)
     decide, effects = word_effects(question)
-    # Attention to the words: one call.
-    read = words(question, named_at=SHOWN_AT)
+    read = words(question)
     missing = len(question.selected) - asked.height
     rerun = all(store.attributes.rerun_of is not None for store in question.stores)
     left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] * (missing > 0)

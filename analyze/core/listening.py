@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.exchanged import words_by_kind
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.statistics.exact_tests import Shuffled, fewer, share_interval, share_shown, shuffled
-from vla_attention.analyze.statistics.many_looks import NAMED_AT, holm
+from vla_attention.analyze.statistics.many_looks import SHOWN_AT, holm
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.words import folded_words
 
 LISTENS = "Does it listen?"
-#: p of what is done, and q of a word that is read: three kinds of things are named (rates: benchmarks/README.md).
-SHOWN_AT = NAMED_AT / 3
 #: From this share of episodes on, what was done most is said.
 _MOSTLY = 0.8
 #: Of the words that are heard, or not, so many are named.

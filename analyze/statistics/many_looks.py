@@ -13,6 +13,9 @@ import numpy as np
 
 #: A name is printed when its p-value is at most this, divided by the number of names that a text could print.
 NAMED_AT = 0.05
+#: Of what is done and of the words that are read, wherever they are named: the screen of `language` names three kinds
+#: of things, and `words` says of one table what it says (rates: benchmarks/README.md).
+SHOWN_AT = NAMED_AT / 3
 
 
 def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:

@@ -23,10 +23,10 @@ from tests.kit.stores import rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.language import language
 from vla_attention.analyze.core.behaviour import with_choices
-from vla_attention.analyze.core.listening import SHOWN_AT, listens, parts_heard
+from vla_attention.analyze.core.listening import listens, parts_heard
 from vla_attention.analyze.core.perturbations import by_suite
 from vla_attention.analyze.statistics.exact_tests import at_least, fewer, mcnemar, share_interval, share_shown, shuffled
-from vla_attention.analyze.statistics.many_looks import holm
+from vla_attention.analyze.statistics.many_looks import SHOWN_AT, holm
 from vla_attention.schemas.interventions import Interventions, PromptChange
 
 EIGHT = [task for task in range(3) for _ in range(8)]
