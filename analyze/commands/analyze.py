@@ -11,7 +11,6 @@ import polars as pl
 from vla_attention.analyze.commands.apart import kept_apart
 from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.holdings import holdings, overlaps_of
-from vla_attention.analyze.commands.language import listens
 from vla_attention.analyze.core.about import (
     GROUP_COLUMNS,
     NORM_COLUMNS,
@@ -29,6 +28,7 @@ from vla_attention.analyze.core.axes import COLUMNS, check_axes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
+from vla_attention.analyze.core.listening import listens
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.sinks import SinkRule, search_sinks
 from vla_attention.analyze.core.sinks import without_sinks as take_out

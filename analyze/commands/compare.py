@@ -8,19 +8,19 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, perturbed, tables_of
-from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
 from vla_attention.analyze.commands.naming_tables import of_runs
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import PAIR, Compared, RunValues, by_themselves, compared
+from vla_attention.analyze.core.listening import IN_PART, listens, whatever
 from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.task_families import sampling_of
 from vla_attention.analyze.statistics.exact_tests import mcnemar
-from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.many_looks import NAMED_AT, SHOWN_AT
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.safe_text import visible
@@ -146,7 +146,8 @@ def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame)
         p = "p < 0.001" if float(str(numbers["p"])) < 0.001 else f"p = {numbers['p']:.2g}"
         counts = f"{numbers['right']} of {numbers['n']} episodes, shuffled instructions: {p}"
         often = whatever(asked.filter(pl.col("left_out").is_null())).removesuffix("; ")
-        said.append(f"{run} does what it is told ({counts})" if hears else
+        of = " in part" if numbers["verdict"] == IN_PART else ""
+        said.append(f"{run} does what it is told{of} ({counts})" if hears else
                     f"{run} is not shown to listen ({counts}){f': {often}' if often else ''}")  # fmt: skip
     verdict = f"{said[0]}; {said[1]}." if does != [False, True] else f"{said[1]}; {said[0]}."
     listening = Finding(verdict, _LISTEN, {f"{key}_{side}": value for side, numbers in zip(("first", "other"), heard,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import polars as pl
@@ -12,17 +11,14 @@ import polars as pl
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.behaviour import OTHER_GOAL, TOLD_SO, UNFINISHED, behaviour
 from vla_attention.analyze.core.camera_maps import stored_picture
-from vla_attention.analyze.core.courses import Leaving, leavings, strip_of
-from vla_attention.analyze.core.measure import measure, table_of
-from vla_attention.analyze.core.object_shares import ALL_CAMERAS, measure_objects, object_times, with_coverage
+from vla_attention.analyze.core.courses import LOOK, Leaving, beside, leavings, strip_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.core.word_items import items_of
+from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.safe_text import visible
 
-_EPISODE = ["suite", "task_id", "episode_index"]
 _OUTCOME = ("suite", "task_id", "instruction", "solved", "num_steps")
 #: Columns that only `behaviour` and joins need.
 _KEYS = ("goals", "scene", "state", "as_told", "told_goal", "own_goal", "scene_goal", "twin_index", "twin_replan")
@@ -62,8 +58,8 @@ def failures(question: Question, twins: Question | None = None) -> Result:
             f"None of the {len(failed)} failed episodes has a twin in {listing(s.path for s in twins.stores)}: no "
             "solved episode there has the same task and initial state; give one of the same suite, tasks and seed."
         )
-    places = _beside(question, twins or question, left)
-    rows = lost.join(places, on=_EPISODE, how="left", maintain_order="left").drop(_KEYS)
+    places = beside(question, twins or question, left)
+    rows = lost.join(places, on=EPISODE_ID, how="left", maintain_order="left").drop(_KEYS)
     tables = [_instead(lost), Table("failures", rows, _FAILURES, "Failure by failure")] if lost.height else []
     where = _where(places, len(failed), twins is not None) if failed else []
     return Result(
@@ -120,47 +116,6 @@ def _group(row: dict[str, Any]) -> str:
     return f"{row['episodes']} {first}{then}"
 
 
-def _beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.DataFrame:
-    """Where each failed episode left its twins, and what both had most attention on in that replan."""
-    rows = []
-    for one in left:
-        at, twin = one.replan, one.twin.episode
-        own = (*one.item.task, one.item.episode.attributes.episode_index, at, one.num_solved)
-        row: dict[str, object] = dict(zip((*_EPISODE, "replan", "num_solved"), own, strict=True))
-        row |= {"twin": twin.name, "twin_index": twin.attributes.episode_index}
-        if at is not None:
-            row |= {"step": int(one.starts[at]), "twin_replan": min(at, twin.attributes.num_replans - 1)}
-            row |= {"apart": 100 * float(one.apart[at]), "within": 100 * float(one.within[at])}
-        rows.append(row)
-    places = pl.DataFrame(rows, schema=_PLACES)
-    mine = _attention(question, [one.item for one in left if one.replan is not None])
-    theirs = _attention(other, [one.twin for one in left if one.replan is not None]).rename(
-        {"episode_index": "twin_index", "replan": "twin_replan", "looked": "twin_looked", "read": "twin_read"}
-    )
-    places = places.join(mine, on=[*_EPISODE, "replan"], how="left", maintain_order="left")
-    return places.join(theirs, on=["suite", "task_id", "twin_index", "twin_replan"], how="left", maintain_order="left")
-
-
-def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataFrame:
-    """Per replan of these episodes: `looked` and `read`, the object and the word with most attention per token."""
-    place = [*_EPISODE, "replan"]
-    found = pl.DataFrame(schema={**{name: _PLACES[name] for name in place}, "looked": pl.String, "read": pl.String})
-    if not items:
-        return found
-    part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
-    lifts = table_of(measure(part, items_of), {"replan"}).filter(pl.col("kind") == "word").collect()
-    most = lifts.drop_nulls("lift").sort("lift", "item", descending=[True, False])
-    read = most.group_by(place, maintain_order=True).agg(read=pl.first("item"))
-    try:
-        times = object_times(measure_objects(with_coverage(part))).collect()
-    except BadArgument:  # no object is marked in the pictures: `objects` says why
-        return pl.concat([found, read], how="diagonal")
-    per_area = times.filter(camera=ALL_CAMERAS, kind="object").with_columns(of=pl.col("share") / pl.col("even_share"))
-    most = per_area.filter(pl.col("of").is_finite()).sort("of", "item", descending=[True, False])
-    looked = most.group_by(place, maintain_order=True).agg(looked=pl.first("item").str.replace_all("_", " "))
-    return looked.join(read, on=place, how="full", coalesce=True).select(found.columns)
-
-
 def _where(places: pl.DataFrame, num_failed: int, given: bool) -> list[Finding]:
     if places.is_empty():
         said = "Not known: the tasks that failed have fewer than two solved episodes to compare with"
@@ -176,8 +131,11 @@ def _where(places: pl.DataFrame, num_failed: int, given: bool) -> list[Finding]:
     said = f"Episode {row['episode_index']} of task {row['task_id']} does at step {row['step']}: from there on its hand"
     said += f" is {row['apart']:.1f} cm from theirs, more than {than}"
     if row["looked"] and row["twin_looked"]:
-        other = "in both" if row["looked"] == row["twin_looked"] else f"of the solved one on the {row['twin_looked']}"
-        said += f". Most attention is then on the {row['looked']}, {other}"
+        numbers |= {name: row[name] for name in LOOK}
+        rest = "" if row["background"] is None else f", the background {row['background']:.0%}"
+        said += f". For its size the {row['looked']} gets most attention then ({row['times']:.2g} times what its area "
+        said += f"gives; {row['share']:.0%} of the attention to the pictures{rest}), "
+        said += "in both" if row["looked"] == row["twin_looked"] else f"of the solved one the {row['twin_looked']}"
     alone = num_failed - places.height
     limit = f"{plural(alone, 'failed episode')} had none to compare with. " if alone else ""
     limit += "" if given else f"By chance alone one of {row['num_solved'] + 1} episodes would be the farthest. "
@@ -230,11 +188,6 @@ def _strip(left: Sequence[Leaving]) -> list[Figure]:
     return [Figure("failure", "pictures", rows, title, options=look)]
 
 
-_PLACES: dict[str, Any] = {
-    "suite": pl.String, **dict.fromkeys(("task_id", "episode_index"), pl.Int64), "twin": pl.String,
-    **dict.fromkeys(("twin_index", "replan", "twin_replan", "step", "num_solved"), pl.Int64),
-    "apart": pl.Float64, "within": pl.Float64,
-}  # fmt: skip
 _FAILURES = [
     Column("task_id", "count", "task"),
     Column("episode_index", "count", "episode"),

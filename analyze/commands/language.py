@@ -16,22 +16,14 @@ from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.exchanged import exchanged
+from vla_attention.analyze.core.listening import LISTENS, listens, table_of_parts
 from vla_attention.analyze.core.naming import named_in
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.exact_tests import shuffled
-from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import plural
 from vla_attention.schemas.safe_text import visible
 
-_LISTENS = "Does it listen?"
-#: p of what is done, and q of a word that is read: three kinds of things are named (rates: benchmarks/README.md).
-SHOWN_AT = NAMED_AT / 3
-#: From this share of episodes on, what was done most is said.
-_MOSTLY = 0.8
-#: Of episodes or steps.
-_HALF = 0.5
 #: Of a probability, and of an action in its unit (as effects are refused from there on): smaller changes are rounding.
 _ROUNDING, _SAME_ACTION = 1e-6, 1e-4
 
@@ -46,7 +38,7 @@ def language(question: Question) -> Result:
     behaved = listens(asked)
     if (source := question.stores[0].attributes.rerun_of) is not None and asked.is_empty():
         said = f"A rerun executes nothing. What was done is in the run that it came from, {visible(source.name)}."
-        behaved = Finding(said, _LISTENS)
+        behaved = Finding(said, LISTENS)
     if not asked.is_empty():
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
         behaved = replace(behaved, next_step=failures)
@@ -55,8 +47,7 @@ def language(question: Question) -> Result:
     by_change, changes = _perturbed(question, asked)
     reached = words_get_through(question)
     decide, effects = word_effects(question)
-    # Attention to the words: one call.
-    read = words(question, named_at=SHOWN_AT)
+    read = words(question)
     missing = len(question.selected) - asked.height
     rerun = all(store.attributes.rerun_of is not None for store in question.stores)
     left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] * (missing > 0)
@@ -108,65 +99,6 @@ def words_get_through(question: Question) -> list[Finding]:
     return [Finding(sentence, "Do the words get through?", numbers, limit)]
 
 
-def listens(asked: pl.DataFrame) -> Finding:
-    """Whether it did what it was told more often than with shuffled instructions, of the rows of `with_choices`."""
-    if asked.is_empty():
-        return Finding(
-            "Nobody knows what it did: the store holds no steps (positions, touches, goals), which our simulators "
-            "record. A rerun of stored calls does nothing of its own.",
-            _LISTENS,
-            next_step="vla-attention capture --help",
-        )
-    shown, n = asked.filter(pl.col("left_out").is_null()), asked.height
-    rest = [*asked.drop_nulls("left_out")["left_out"].value_counts(sort=True).sort("left_out").iter_rows()]
-    left = [f"{plural(count, 'episode')} left out: {why}." for why, count in rest]
-    if shown.is_empty():
-        done = asked.filter("as_told").height
-        whys = "; ".join(f"in {count} of {plural(n, 'episode')}, {why}" for why, count in rest)
-        return Finding(
-            f"These episodes cannot show whether it listens: {whys}. It did what it was told in {done} of {n}.",
-            _LISTENS,
-            {"right": done, "n": n},
-            "Tell two tasks in one scene, best from the same initial states.",
-        )
-    found = shuffled(shown["told_goal"].to_list(), shown["first"].to_list(), shown["stratum"].to_list())
-    right, n = found.matches, shown.height
-    p = "p < 0.001" if found.p_value < 0.001 else f"p = {found.p_value:.2g}"
-    by_chance = f"shuffled instructions: {found.expected:.3g} expected, {p}"
-    where = "in which the scene allowed something else"
-    # Where each task has its own initial states, the pictures say what to do as well as the words.
-    shared = shown.select((pl.col("told_goal").n_unique().over("stratum", "state") > 1).mean()).item() >= _HALF
-    if found.p_value > SHOWN_AT:
-        sentence = f"Not shown to listen: {whatever(shown)}it did what it was told in {right} of {n} episodes {where}"
-    elif not shared:
-        sentence = f"It did what it was told in {right} of {n} episodes {where}"
-    else:
-        verdict = "It listens" if 2 * right > n else "It listens in part"
-        sentence = f"{verdict}: it did what it was told in {right} of {n} episodes {where}"
-    limits = []
-    if found.least_p > SHOWN_AT:
-        limits.append(f"Too few episodes: even without a mistake p would be {found.least_p:.2g}.")
-    if not shared:
-        limits.append("Each task has its own initial states here, so the pictures could say what to do.")
-    if nothing := shown["first"].null_count():
-        limits.append(f"In {plural(nothing, 'episode')} none of the told goals was reached.")
-    another = pl.col("before").is_not_null() | pl.col("first").ne_missing(pl.col("told_goal"))
-    if others := shown.filter(pl.col("outcome") & another).height:
-        limits.append(f"In {plural(others, 'solved episode')} another goal held before the told one.")
-    numbers = {"right": right, "n": n, "expected": found.expected, "p": found.p_value, "nothing_reached": nothing}
-    return Finding(f"{sentence} ({by_chance}).", _LISTENS, numbers, " ".join([*limits, *left]))
-
-
-def whatever(shown: pl.DataFrame) -> str:
-    """What was done in most of the episodes, told more than one thing."""
-    for column, how in (("touched", "touched the {}"), ("did", "reached the goal of '{}'")):
-        for value, count in shown[column].drop_nulls().value_counts(sort=True).head(1).iter_rows():
-            if count >= _MOSTLY * shown.height and shown.filter(pl.col(column) == value)["told_goal"].n_unique() > 1:
-                often = f"in {count} of {shown.height} episodes"
-                return f"whatever it was told, it {how.format(value)} first ({often}); "
-    return ""
-
-
 def _behaviour_tables(asked: pl.DataFrame) -> list[Table]:
     """Told and did, counted, and every episode."""
     if asked.is_empty():
@@ -177,10 +109,11 @@ def _behaviour_tables(asked: pl.DataFrame) -> list[Table]:
     matrix = matrix.sort("told", "episodes", "did", descending=[False, True, False])
     result = pl.col("outcome").replace_strict({True: "solved", False: "failed"}, default="not known")
     rows = asked.with_columns(outcome=result).drop(
-        "goals", "scene", "stratum", "state", "own_goal", "told_goal", "as_told", "first", "scene_goal"
+        "goals", "scene", "stratum", "block", "state", "own_goal", "told_goal", "as_told", "first", "scene_goal"
     )
     return [
         Table("told_and_did", matrix, _MATRIX, "Told and did", rows=20),
+        *table_of_parts(asked),
         Table("told_episodes", rows.sort("suite", "task_id", "episode_index"), _EPISODES, "Episode by episode", rows=8),
     ]
 

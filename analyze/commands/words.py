@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
+from statistics import median
+from typing import Any
 
 import polars as pl
 
@@ -14,7 +16,8 @@ from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.word_items import LABELS, SCALE, items_of
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.many_looks import SHOWN_AT
+from vla_attention.analyze.statistics.units import Estimand
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.layout import Role
@@ -26,10 +29,10 @@ _MOST_NAMED = 5
 LIFT = "attention to the word, over what it would get if attention were spread evenly over all tokens"
 
 
-def words(question: Question, by: Collection[str] = (), named_at: float = NAMED_AT) -> Result:
+def words(question: Question, by: Collection[str] = ()) -> Result:
     """Lift, mass and share of every word; which are read more, and which less, than evenly spread attention would.
 
-    named_at: words with at most this q are named; a screen that names other things too asks for less.
+    A word is named at q <= `SHOWN_AT`, about tasks like these where enough families have it, else about these tasks.
 
     Raises:
         BadArgument: the keys of the site spell no words.
@@ -44,11 +47,15 @@ def words(question: Question, by: Collection[str] = (), named_at: float = NAMED_
     kept = columns_of(by)
     looks = [column.name for column in kept]
     rows = with_families(_without_shares(table_of(measured, axes)).collect(), question.sampling)
-    summary = estimate(rows, [*looks, *LABELS], _VALUES, question.sampling, {"lift": 1.0}, [*looks, "kind"])
+    num_looks = max(1, rows.filter(kind=shown).select(*LABELS).n_unique())
+    summary = estimate(rows, [*looks, *LABELS], _VALUES, question.sampling, {"lift": 1.0}, [*looks, "kind"],
+                       detect={"lift": SHOWN_AT / num_looks})  # fmt: skip
     order = ("place", False) if shown == "place" else ("lift", True)
     summary = summary.drop("keys_low", "keys_high").sort(
         *looks, "kind", order[0], descending=[*(False for _ in looks), False, order[1]], nulls_last=True
     )
+    finding = _finding(question, summary.filter(kind=shown), by)
+    summary = summary.drop("lift_detectable")
     columns = [*kept, *_columns(question.num_tasks)]
     is_shown = pl.col("kind") == shown
     is_scale = pl.col("kind") == "scale"
@@ -57,7 +64,7 @@ def words(question: Question, by: Collection[str] = (), named_at: float = NAMED_
     return Result(
         "Which words of the instruction are read",
         about(question),
-        [_finding(question, summary.filter(is_shown), by, named_at)],
+        [finding],
         [
             Table("words", summary, columns, "Words of the instruction", is_shown),
             Table("words_scale", summary.filter(is_scale), columns, "For scale"),
@@ -106,7 +113,7 @@ def _columns(num_tasks: int) -> list[Column]:
     ]
 
 
-def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named_at: float) -> Finding:
+def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
     recorded = any(item.episode.attributes.effects is not None for item in question.selected)
     path = shlex.quote(str(question.stores[0].path))
@@ -117,32 +124,52 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named
         return Finding(
             f"Below, a row for each word and {' and '.join(by)}.", "Which words are read?", {}, limit, effects
         )
-    # What is shown of one task's words alone is no answer about a run of many.
-    alike = pl.col("intervals") == question.units.estimand.value
-    sure = words.filter(alike | (question.num_tasks == 1), pl.col("lift_q") <= named_at)
-    more = sure.filter(pl.col("lift") > 1).sort("lift", descending=True)
-    less = sure.filter(pl.col("lift") < 1).sort("lift")
-    said = [
-        f"{which}: {', '.join(_named(row) for row in part.head(_MOST_NAMED).iter_rows(named=True))}"
-        + (f" and {part.height - _MOST_NAMED} more" if part.height > _MOST_NAMED else "")
-        for which, part in (("more than its share of attention goes to", more), ("less than its share goes to", less))
-        if part.height
-    ]
+    sure = words.filter(pl.col("lift_q") <= SHOWN_AT).sort("lift", descending=True).to_dicts()
+    if not sure:
+        return Finding(*_nothing_named(words, limit), effects)
+    # A word that few families have says nothing about other tasks, but it may be what is read most in these.
+    here = [row for row in sure if row["intervals"] == Estimand.THESE_TASKS]
+    like = [row for row in sure if row["intervals"] != Estimand.THESE_TASKS]
+    parts = [("In tasks like these, ", like), ("In these tasks, ", here)]
+    few = "Words that fewer than four kinds of tasks have say nothing about other tasks. " * bool(here)
+    if question.num_tasks == 1 or question.units.estimand == Estimand.THESE_TASKS:
+        parts, few = [("", sure)], ""
+    # What is read more comes first.
+    parts = sorted((part for part in parts if part[1]), key=lambda part: part[1][0]["lift"] <= 1)
+    said = [f"{begin}{_more_and_less(part)}." for begin, part in parts]
+    top = parts[0][1][0] if parts[0][1][0]["lift"] > 1 else parts[0][1][-1]
+    numbers = {"word": top["item"], "estimate": top["lift"], "low": top["lift_low"], "high": top["lift_high"],
+               "q": top["lift_q"], "like_these": len(like), "these": len(here)}  # fmt: skip
+    sentence = " ".join(f"{one[0].upper()}{one[1:]}" for one in said)
+    return Finding(sentence, "Which words are read?", numbers, f"{few}{limit}", effects)
+
+
+def _nothing_named(words: pl.DataFrame, limit: str) -> tuple[str, str, dict[str, float | int | str | None], str]:
+    """Sentence, question, numbers and limit: how much a run of this size would have shown."""
+    known = words["lift_detectable"].drop_nulls().to_list()
     tested = words["lift_q"].len() - words["lift_q"].null_count()
-    if not said:
-        verdict = (
-            f"No word is shown to get more, or less, than its share of attention ({plural(tested, 'word')} tested)."
+    could = "One episode of a word has no interval: record more episodes."
+    if known:
+        times = median(known)
+        could = (
+            f"So many episodes show a word in 80% of runs that gets {times:.2g} times its share, or {1 / times:.2g}."
         )
-        few = "" if tested else "One episode of a word has no interval: record more episodes. "
-        return Finding(verdict, "Which words are read?", {"tested": tested}, f"{few}{limit}", effects)
-    top = (more if more.height else less).row(0, named=True)
-    numbers = {"word": top["item"], "estimate": top["lift"], "low": top["lift_low"], "high": top["lift_high"]}
-    sentence = "; ".join(said)
-    sentence = f"{sentence[0].upper()}{sentence[1:]}."
-    return Finding(sentence, "Which words are read?", {**numbers, "q": top["lift_q"]}, limit, effects)
+    verdict = f"No word is shown to get more, or less, than its share of attention ({plural(tested, 'word')} tested)."
+    numbers: dict[str, float | int | str | None] = {"tested": tested, "detectable": median(known) if known else None}
+    return verdict, "Which words are read?", numbers, f"{could} {limit}"
 
 
-def _named(row: dict[str, object]) -> str:
-    lift = row["lift"]
-    assert isinstance(lift, float)
-    return f"'{row['item']}' ({lift:.2g} times)"
+def _more_and_less(words: Sequence[Mapping[str, Any]]) -> str:
+    """Of words that are shown, sorted downwards: those with more than their share, and those with less."""
+    more, less = [row for row in words if row["lift"] > 1], [row for row in reversed(words) if row["lift"] < 1]
+    said, goes = [], "share of attention goes to"
+    for which, part in (("more", more), ("less", less)):
+        if part:
+            rest = f" and {len(part) - _MOST_NAMED} more" if len(part) > _MOST_NAMED else ""
+            said.append(f"{which} than its {goes}: {', '.join(map(_named, part[:_MOST_NAMED]))}{rest}")
+            goes = "share goes to"
+    return "; ".join(said)
+
+
+def _named(row: Mapping[str, Any]) -> str:
+    return f"'{row['item']}' ({row['lift']:.2g} times)"

@@ -231,15 +231,18 @@ def with_choices(frame: pl.DataFrame) -> pl.DataFrame:
     those of templates with one told goal share one. An episode ends when its task is done, so that what comes later is
     not seen: what counts is which of the stratum's told goals held first, and that is the same whatever was told.
 
+    In a block only the words say what to do: it is a stratum, where every state was told everything equally often, else
+    the stratum's episodes of one initial state, as a picture that one task has alone says what to do, too.
+
     Returns:
         further columns: stratum; first (of the stratum's told goals, the one that held first; null: none, or several
-        at once); left_out (why the episode shows nothing; null: it does).
+        at once); left_out (why the episode shows nothing; null: it does); block.
     """
     of_kind = pl.col("told_goal").n_unique().over("suite", "scene", "family")
     kind = pl.when((pl.col("family") != "") & (of_kind > 1)).then("family").otherwise(pl.lit(""))
     frame = frame.with_columns(stratum=pl.concat_str(["suite", "scene", kind], separator="\t"))
     parts = [_of_stratum(part) for part in frame.partition_by("stratum", maintain_order=True)]
-    empty = frame.clear().with_columns(first=pl.lit(None, pl.String), left_out=pl.lit(None, pl.String))
+    empty = frame.clear().with_columns(pl.lit(None, pl.String).alias(name) for name in ("first", "left_out", "block"))
     return pl.concat([empty, *parts])
 
 
@@ -261,5 +264,12 @@ def _of_stratum(part: pl.DataFrame) -> pl.DataFrame:
         .then(pl.lit(_PART))
     )
     part = part.join(first, on=episode, how="left", maintain_order="left").with_columns(left_out=left_out)
-    alone = part.filter(pl.col("left_out").is_null())["told_goal"].n_unique() == 1
+    left = part.filter(pl.col("left_out").is_null())
+    crossed = left.group_by("state", "told_goal").len()
+    of_state, of_goal = (pl.sum("len").over(column) for column in ("state", "told_goal"))
+    # With as many of all pairs as the state's and the goal's own numbers give, the state says nothing of the goal.
+    even = crossed.select((pl.col("len") * left.height == of_state * of_goal).all()).item()
+    even = even and crossed.height == crossed["state"].n_unique() * crossed["told_goal"].n_unique()
+    part = part.with_columns(block="stratum" if even else pl.concat_str(["stratum", "state"], separator="\t"))
+    alone = left["told_goal"].n_unique() == 1
     return part.with_columns(pl.coalesce("left_out", pl.lit(ALONE)).alias("left_out")) if alone else part

@@ -9,14 +9,21 @@ ended.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.measure import measure, table_of
+from vla_attention.analyze.core.object_shares import ALL_CAMERAS, measure_objects, object_times, with_coverage
+from vla_attention.analyze.core.word_items import items_of
+from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.episode_steps import HAND, POSES
+from vla_attention.schemas.errors import BadArgument
 
 Array = NDArray[np.float64]
 
@@ -30,6 +37,15 @@ FEWEST = 3
 _TWINS = 3
 #: Replans of a strip, from the one at which an episode leaves.
 _SHOWN = (-1, 0, 1, 2)
+
+
+_PLACES: dict[str, Any] = {
+    "suite": pl.String, **dict.fromkeys(("task_id", "episode_index"), pl.Int64), "twin": pl.String,
+    **dict.fromkeys(("twin_index", "replan", "twin_replan", "step", "num_solved"), pl.Int64),
+    "apart": pl.Float64, "within": pl.Float64,
+}  # fmt: skip
+#: Of the object with most attention for its size.
+LOOK = ("times", "share", "background")
 
 
 @dataclass(frozen=True)
@@ -196,3 +212,55 @@ def leaves_at(apart: Array, within: Array) -> int | None:
     inside = np.flatnonzero(apart <= within)
     first = int(inside[-1]) + 1 if len(inside) else 0
     return first if first + min(FEWEST, len(apart)) <= len(apart) else None
+
+
+def beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.DataFrame:
+    """Where each failed episode left its twins, and what both had most attention on in that replan.
+
+    Returns:
+        `EPISODE_ID`, twin, replan and step (null: it does not leave), apart and within (centimetres), num_solved;
+        looked and read (the object with most attention for its size, the word with most per token), twin_looked,
+        twin_read; times (attention to the object, over that of its area), share and background (parts of the attention
+        to the pictures).
+    """
+    rows = []
+    for one in left:
+        at, twin = one.replan, one.twin.episode
+        own = (*one.item.task, one.item.episode.attributes.episode_index, at, one.num_solved)
+        row: dict[str, object] = dict(zip((*EPISODE_ID, "replan", "num_solved"), own, strict=True))
+        row |= {"twin": twin.name, "twin_index": twin.attributes.episode_index}
+        if at is not None:
+            row |= {"step": int(one.starts[at]), "twin_replan": min(at, twin.attributes.num_replans - 1)}
+            row |= {"apart": 100 * float(one.apart[at]), "within": 100 * float(one.within[at])}
+        rows.append(row)
+    places = pl.DataFrame(rows, schema=_PLACES)
+    mine = _attention(question, [one.item for one in left if one.replan is not None])
+    theirs = _attention(other, [one.twin for one in left if one.replan is not None]).drop(LOOK)
+    theirs = theirs.rename({"episode_index": "twin_index"} | {n: f"twin_{n}" for n in ("replan", "looked", "read")})
+    places = places.join(mine, on=[*EPISODE_ID, "replan"], how="left", maintain_order="left")
+    return places.join(theirs, on=["suite", "task_id", "twin_index", "twin_replan"], how="left", maintain_order="left")
+
+
+def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataFrame:
+    """Per replan of these episodes, what `beside` says of the attention in it."""
+    place = [*EPISODE_ID, "replan"]
+    schema = {**{name: _PLACES[name] for name in place}, **dict.fromkeys(("looked", "read"), pl.String)}
+    found = pl.DataFrame(schema={**schema, **dict.fromkeys(LOOK, pl.Float64)})
+    if not items:
+        return found
+    part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
+    lifts = table_of(measure(part, items_of), {"replan"}).filter(pl.col("kind") == "word").collect()
+    most = lifts.drop_nulls("lift").sort("lift", "item", descending=[True, False])
+    read = most.group_by(place, maintain_order=True).agg(read=pl.first("item"))
+    try:
+        times = object_times(measure_objects(with_coverage(part))).collect()
+    except BadArgument:  # no object is marked in the pictures: `objects` says why
+        return pl.concat([found, read], how="diagonal")
+    times = times.filter(camera=ALL_CAMERAS).with_columns(times=pl.col("share") / pl.col("even_share"))
+    most = times.filter(pl.col("times").is_finite(), kind="object").sort("times", "item", descending=[True, False])
+    looked = most.group_by(place, maintain_order=True).agg(
+        pl.first("times", "share"), looked=pl.first("item").str.replace_all("_", " ")
+    )
+    background = times.filter(kind="class", item="background").select(*place, background="share")
+    looked = looked.join(background, on=place, how="left")
+    return looked.join(read, on=place, how="full", coalesce=True).select(found.columns)

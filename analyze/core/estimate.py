@@ -38,6 +38,7 @@ def estimate(
     family: Collection[str] = (),
     quotients: Mapping[str, tuple[str, str]] | None = None,
     together: Collection[str] = (),
+    detect: Mapping[str, float] | None = None,
 ) -> pl.DataFrame:
     """Mean of each value for every item of `by`, over tasks of the tasks' means, with its interval (see `intervals`).
 
@@ -53,13 +54,14 @@ def estimate(
         family: of `by`, the columns inside of whose values the looks are counted; all rows are one look's unless given.
         quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
         together: of `nulls`, those of which an item is named by any: their looks are counted together.
+        detect: of `nulls`, the ones of which is asked what would have been shown, with the p at which one is.
 
     Returns:
         One row per item in order of first appearance: `by`, num_episodes, num_tasks, num_families, intervals; per value
         V, V_low, V_high (null where there is none), and of `nulls` V_q, the p of this null adjusted for the number of
-        rows (Benjamini-Hochberg).
+        rows (Benjamini-Hochberg); of `detect` V_detectable, see `Estimate.detectable`.
     """
-    nulls, quotients = nulls or {}, quotients or {}
+    nulls, quotients, detect = nulls or {}, quotients or {}, detect or {}
     needed = dict.fromkeys([*values, *(name for pair in quotients.values() for name in pair)])
     logs = {name: table[name].log() if values.get(name) == "geometric" else table[name] for name in needed}
     columns = {name: float_values(column) for name, column in logs.items()}
@@ -93,10 +95,13 @@ def estimate(
                 found[i][f"{name}_low"], found[i][f"{name}_high"] = one.interval() or (None, None)
                 if name in nulls:
                     found[i][f"{name}_p"] = one.p_value(nulls[name])
+                if name in detect:
+                    found[i][f"{name}_detectable"] = one.detectable(nulls[name], detect[name])
     schema: dict[str, Any] = {"num_episodes": pl.Int64, "num_tasks": pl.Int64, "num_families": pl.Int64,
                               "intervals": pl.String}  # fmt: skip
     for name in (*values, *quotients):
-        ends = (name, f"{name}_low", f"{name}_high", *([f"{name}_p"] if name in nulls else []))
+        more = [f"{name}_p"] * (name in nulls) + [f"{name}_detectable"] * (name in detect)
+        ends = (name, f"{name}_low", f"{name}_high", *more)
         schema |= dict.fromkeys(ends, pl.Float64)
     rows = pl.concat([items.drop("_row"), pl.DataFrame(found, schema=schema)], how="horizontal")
     for name in nulls:

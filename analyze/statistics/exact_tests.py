@@ -1,10 +1,11 @@
-"""Exact tests of counts: instructions that are shuffled over episodes, and pairs that differ. Pure functions."""
+"""Exact tests and intervals of counts: instructions shuffled over episodes, shares, pairs. Pure functions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from math import comb, factorial, prod
+from math import comb, exp, factorial, fsum, lgamma, log, log1p, prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,18 +41,44 @@ def shuffled(told: Sequence[str], did: Sequence[str | None], strata: Sequence[st
         did: (episode,) what each did; None: nothing that anybody was told.
         strata: (episode,) within which instructions are shuffled.
     """
-    chances, expected, least = np.ones(1), 0.0, 1.0
-    for stratum in sorted(set(strata)):
-        members = [(t, d) for t, d, s in zip(told, did, strata, strict=True) if s == stratum]
-        names = sorted({t for t, _ in members})
-        counts = [(sum(t == name for t, _ in members), sum(d == name for _, d in members)) for name in names]
-        chances = np.convolve(chances, _chances_of_matches(counts, len(members)))
-        expected += sum(of_told * of_did for of_told, of_did in counts) / len(members)
-        least *= prod(factorial(of_told) for of_told, _ in counts) / factorial(len(members))
+    expected, least = 0.0, 1.0
+    for counts, number in _counted(told, did, strata):
+        expected += sum(of_told * of_did for of_told, of_did in counts) / number
+        least *= prod(factorial(of_told) for of_told, _ in counts) / factorial(number)
     matches = sum(t == d for t, d in zip(told, did, strict=True))
+    return Shuffled(matches, expected, float(_tails(told, did, strata)[matches]), least)
+
+
+def share_shown(told: Sequence[str], strata: Sequence[str], level: float, power: float = 0.8) -> float | None:
+    """The smallest share of right episodes that `shuffled` would show, with p at most `level`, in a run of this size.
+
+    It is shown with this power, of a policy that reaches each goal as often as it is told; None where no share is
+    enough.
+    """
+    enough = np.flatnonzero(_tails(told, told, strata) <= level)
+    return _share_where(lambda share: at_least(int(enough[0]), len(told), share) >= power) if len(enough) else None
+
+
+def _counted(
+    told: Sequence[str], did: Sequence[str | None], strata: Sequence[str]
+) -> Iterator[tuple[list[tuple[int, int]], int]]:
+    """Of every stratum: how many episodes were told and did each thing that was told, and how many there are."""
+    members: dict[str, list[tuple[str, str | None]]] = {}
+    for t, d, stratum in zip(told, did, strata, strict=True):
+        members.setdefault(stratum, []).append((t, d))
+    for pairs in members.values():
+        of_told, of_did = Counter(t for t, _ in pairs), Counter(d for _, d in pairs)
+        yield [(number, of_did[name]) for name, number in sorted(of_told.items())], len(pairs)
+
+
+def _tails(told: Sequence[str], did: Sequence[str | None], strata: Sequence[str]) -> NDArray[np.float64]:
+    """Probability (matches,) of at least 0, 1, ... matches over all ways to shuffle."""
+    chances = np.ones(1)
+    for counts, number in sorted(_counted(told, did, strata)):  # equal strata in any order give equal digits
+        chances = np.convolve(chances, _chances_of_matches(counts, number))
     # Rounding of the convolution must not make a certain event less than certain.
-    p_value = min(1.0, float(chances[matches:].sum()) / float(chances.sum()))
-    return Shuffled(matches, expected, p_value, least)
+    tails: NDArray[np.float64] = np.minimum(1.0, np.cumsum(chances[::-1])[::-1] / chances.sum())
+    return tails
 
 
 def _chances_of_matches(counts: Iterable[tuple[int, int]], number: int) -> NDArray[np.float64]:
@@ -80,3 +107,41 @@ def mcnemar(won: int, lost: int) -> float:
     """Two-sided exact p of pairs that differ being won as often as lost (McNemar 1947); 1 where no pair differs."""
     number = won + lost
     return float(min(1.0, 2 * sum(comb(number, k) for k in range(min(won, lost) + 1)) / 2**number))
+
+
+def fewer(right: int, number: int, right_elsewhere: int, elsewhere: int) -> float:
+    """One-sided exact p of `right` of `number` being a smaller share than that of the others (Fisher 1922)."""
+    whole, hits = number + elsewhere, right + right_elsewhere
+    ways = sum(comb(hits, k) * comb(whole - hits, number - k) for k in range(max(0, hits - elsewhere), right + 1))
+    return ways / comb(whole, number)
+
+
+def share_interval(right: int, number: int, level: float = 0.95) -> tuple[float, float]:
+    """The exact interval of a share (Clopper & Pearson 1934), also where all or none of `number` >= 1 are right.
+
+    It holds the truth at least as often as `level` says, also where tasks have shares of their own.
+    """
+    tail = (1.0 - level) / 2
+    low = _share_where(lambda share: at_least(right, number, share) >= tail) if right else 0.0
+    high = _share_where(lambda share: 1.0 - at_least(right + 1, number, share) <= tail) if right < number else 1.0
+    return low, high
+
+
+def at_least(right: int, number: int, share: float) -> float:
+    """The chance that at least `right` of `number` episodes are right, each with the chance `share`."""
+    if share in (0.0, 1.0):
+        return float(right <= number * share)
+    whole, (log_yes, log_no) = lgamma(number + 1), (log(share), log1p(-share))
+    return fsum(
+        exp(whole - lgamma(k + 1) - lgamma(number - k + 1) + k * log_yes + (number - k) * log_no)
+        for k in range(right, number + 1)
+    )
+
+
+def _share_where(holds: Callable[[float], bool]) -> float:
+    """The smallest share from which on something holds."""
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high

@@ -128,6 +128,17 @@ class Estimate:
             return None
         return two_sided_p((self._on_scale(self.value) - self._on_scale(null)) / self.error, self.degrees)
 
+    def detectable(self, null: float, level: float = 1 - DEFAULT_LEVEL, power: float = 0.8) -> float | None:
+        """The smallest truth above `null` that would be shown, with p at most `level`, in this part of such runs.
+
+        A run of this size, whose units scatter as these do; None without a standard error. On a logarithmic scale one
+        over it, of the null, is the largest truth below.
+        """
+        if self.error is None or self.value is None:
+            return None
+        reach = student_quantile(1 - level, self.degrees) + student_quantile(2 * power - 1, self.degrees)
+        return self._from_scale(self._on_scale(null) + reach * self.error)
+
     def _on_scale(self, value: float) -> float:
         return to_scale(math.log(value) if self.exponentiate else value, self.limits)[0]
 

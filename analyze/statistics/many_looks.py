@@ -13,6 +13,9 @@ import numpy as np
 
 #: A name is printed when its p-value is at most this, divided by the number of names that a text could print.
 NAMED_AT = 0.05
+#: Of what is done and of the words that are read, wherever they are named: the screen of `language` names three kinds
+#: of things, and `words` says of one table what it says (rates: benchmarks/README.md).
+SHOWN_AT = NAMED_AT / 3
 
 
 def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
@@ -30,3 +33,11 @@ def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
     for place, q in zip(order, adjusted, strict=True):
         by_place[known[place]] = float(q)
     return by_place
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's adjusted p-values (1979, Scandinavian Journal of Statistics 6): of all claims, none is false in 95 %."""
+    order, adjusted, least = sorted(range(len(p_values)), key=p_values.__getitem__), [1.0] * len(p_values), 0.0
+    for rank, place in enumerate(order):
+        least = adjusted[place] = max(least, min(1.0, (len(order) - rank) * p_values[place]))
+    return adjusted

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -59,7 +60,7 @@ def test_the_planted_moment_is_found(planted):
     found = failures(question_about(planted))
     assert found["failures"]["replan"].is_between(TURN - 1, TURN + 1).all()
     assert found["failures"].height == 6
-    assert found.findings[1].numbers == {"left": 6, "n": 6}
+    assert (found.findings[1].numbers["left"], found.findings[1].numbers["n"]) == (6, 6)
     assert (found["failures"]["apart"] > found["failures"]["within"]).all()
     assert found["failures"].select("looked", "read", "twin_looked", "twin_read").null_count().sum_horizontal()[0] == 0
 
@@ -79,6 +80,14 @@ def test_a_store_of_twins_with_the_same_states():
     rows = found["failures"]
     assert rows["twin"].to_list() == [f"task00{task}_episode00{i}" for task in (0, 1) for i in (0, 1)]
     assert rows["looked"].to_list() == ["blue cube"] * 4
+    # For its size it gets most; of the attention to the pictures, the background has most.
+    numbers = found.findings[1].numbers
+    objects = va.open(PAIR[0]).objects(tasks=0, by="replan", iou=False)["objects_episodes"]
+    of_call = objects.filter(episode_index=0, replan=rows["replan"][0], camera="all", item="blue_cube", kind="object")
+    own = of_call.select(pl.mean("share", "enrichment")).row(0, named=True)
+    assert numbers["share"] == pytest.approx(own["share"])
+    assert numbers["times"] == pytest.approx(own["enrichment"], rel=0.2)  # weighs cameras otherwise
+    assert numbers["background"] > 5 * numbers["share"]
     assert rows["twin_looked"].to_list() == ["red cube"] * 2 + ["green cube"] * 2
     (strip,) = found.figures
     assert strip.frame["row"].unique().to_list() == [0, 1]

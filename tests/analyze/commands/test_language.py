@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from math import factorial
+from math import comb, factorial
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,17 +14,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from benchmarks.null_stores import says_it_listens
+from benchmarks.null_stores import PARTLY_DEAF, of_a_listener, says_it_listens
 from tests.kit.archives import example_store, unpacked
 from tests.kit.made_up_behaviour import COLOURS, did, goals_of
 from tests.kit.paths import GOLDEN
 from tests.kit.questions import question_about
 from tests.kit.stores import rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.commands.language import language, listens
+from vla_attention.analyze.commands.language import language
 from vla_attention.analyze.core.behaviour import with_choices
+from vla_attention.analyze.core.listening import listens, parts_heard
 from vla_attention.analyze.core.perturbations import by_suite
-from vla_attention.analyze.statistics.exact_tests import mcnemar, shuffled
+from vla_attention.analyze.statistics.exact_tests import at_least, fewer, mcnemar, share_interval, share_shown, shuffled
+from vla_attention.analyze.statistics.many_looks import SHOWN_AT, holm
 from vla_attention.schemas.interventions import Interventions, PromptChange
 
 EIGHT = [task for task in range(3) for _ in range(8)]
@@ -160,6 +162,75 @@ def test_many_episodes_are_exact_too():
 def test_null_policies_are_said_to_listen_in_at_most_five_of_a_hundred():
     assert says_it_listens(400, planted=False) <= 0.05
     assert says_it_listens(40, planted=True) > 0.8
+
+
+@pytest.mark.parametrize("policy", PARTLY_DEAF)
+def test_who_hears_a_part_is_not_said_to_hear_the_rest(policy):
+    rates = of_a_listener(policy, 40)
+    assert rates["wrong"] <= 0.05
+    assert rates["found"] >= 0.5 or policy == "pictures"
+
+
+def test_a_policy_that_is_deaf_to_lifts_listens_to_touches_alone():
+    goals = [*COLOURS, *goals_of({3: "lift the red cube", 4: "lift the green cube", 5: "lift the blue cube"})]
+    families = {task: "touch the COLOUR cube" if task < 3 else "lift the COLOUR cube" for task in range(6)}
+    plan = [(task, {task if task < 3 else 5: 5}) for task in range(6) for _ in range(4)]
+    numbers = said(plan, goals, families).numbers
+    assert (numbers["right"], numbers["n"], numbers["verdict"]) == (16, 24, "listens in part")
+    assert (numbers["heard"], numbers["not_heard"]) == ("touch the COLOUR cube", "lift the COLOUR cube")
+    # Who cannot lift is not deaf to it.
+    weak = [(task, {task: 5} if task < 3 or number == 0 else {}) for task in range(6) for number in range(4)]
+    numbers = said(weak, goals, families).numbers
+    assert (numbers["heard"], numbers["not_heard"]) == ("touch the COLOUR cube", "")
+
+
+def test_a_policy_that_hears_only_red_does_not_hear_green_as_well():
+    found = said([(task, {0 if task == 0 else 1: 5}) for task in range(3) for _ in range(4)])
+    assert (found.numbers["right"], found.numbers["n"]) == (8, 12)
+    assert (found.numbers["heard"], found.numbers["not_heard"]) == ("red", "blue")
+    rows = with_choices(did([(task, {0 if task == 0 else 1: 5}) for task in range(3) for _ in range(4)]))
+    green = parts_heard(rows, SHOWN_AT).filter(item="green").row(0, named=True)
+    assert (green["right"], green["num_episodes"], green["verdict"]) == (4, 4, "not shown")
+    assert green["p"] == pytest.approx(2 * comb(8, 4) / comb(12, 4))  # Holm: the second of three
+
+
+def test_where_the_pictures_tell_the_task_only_shared_states_count():
+    """A policy that hears nothing: in the shared states it goes where it likes, else where the picture says."""
+    shared = [did([(task, {state % 3: 5}) for task in range(3)], state=str(state)) for state in range(4)]
+    alone = [did([(state % 3, {state % 3: 5})] * 3, state=str(state)) for state in range(4, 8)]
+    numbers = listens(with_choices(pl.concat([*shared, *alone]).with_columns(episode_index=pl.int_range(24)))).numbers
+    assert (numbers["right"], numbers["n"], numbers["p"], numbers["verdict"]) == (4, 12, 1.0, "not shown")
+
+
+def test_intervals_of_shares():
+    assert share_interval(30, 30) == pytest.approx((0.025 ** (1 / 30), 1.0))
+    assert share_interval(0, 5) == pytest.approx((0.0, 1 - 0.025**0.2))
+    low, high = share_interval(16, 24)
+    assert (low, high) == pytest.approx((0.4468, 0.8437), abs=1e-4)  # R: binom.test(16, 24)
+    assert at_least(16, 24, low) == pytest.approx(0.025)
+    assert 1 - at_least(17, 24, high) == pytest.approx(0.025)
+    assert at_least(1000, 3000, 0.5) == pytest.approx(1.0)
+    assert fewer(0, 4, 8, 8) == pytest.approx(1 / comb(12, 4))
+    assert fewer(4, 4, 8, 8) == 1.0
+
+
+def test_what_a_run_of_this_size_would_show():
+    told, n = [task for task in "abc" for _ in range(4)], 12
+    share = share_shown(told, [""] * n, SHOWN_AT)
+    needed = next(k for k in range(n + 1) if tail(told, k) <= SHOWN_AT)
+    assert at_least(needed, n, share) == pytest.approx(0.8)
+    assert share_shown(["a", "b"], ["", ""], SHOWN_AT) is None
+
+
+def tail(told, least):
+    """By drawing: the share of shuffles with at least so many matches."""
+    generator, told = np.random.default_rng(0), np.array(told)
+    return np.mean([(generator.permutation(told) == told).sum() >= least for _ in range(20_000)])
+
+
+def test_claims_of_which_none_is_false():
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert holm([]) == []
 
 
 def test_effects_say_which_words_decide_and_which_were_not_tested():

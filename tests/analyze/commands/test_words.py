@@ -10,12 +10,15 @@ import polars as pl
 import pytest
 import zarr
 
+from tests.kit.archives import example_store
 from tests.kit.bowl_scene import write_bowl_store
 from tests.kit.questions import question_about
 from tests.kit.stores import write_store
 from tests.kit.tokens import random_rows
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.commands.language import language
 from vla_attention.analyze.commands.words import words
+from vla_attention.analyze.statistics.many_looks import SHOWN_AT
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 
@@ -118,6 +121,51 @@ def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tm
     by_task = words(question_about(tmp_path / "tasks.zarr"), by=("task",))["words"].filter(kind="word", item="the")
     assert by_task["task_id"].to_list() == [0, 1, 2]
     assert by_task["lift"].mean() == pytest.approx(summary.filter(item="the")["lift"][0])
+
+
+def test_a_word_of_few_kinds_of_tasks_is_named_in_these_tasks(tmp_path):
+    """'drawer' stands in one task of five, each of a kind of its own; it is read twenty times as much."""
+
+    def read_drawer(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+        rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode, spread=0.1)
+        for replan, which in enumerate(tokens.prompt_index):
+            for word in tokens.words[which]:
+                rows[replan][..., list(word.keys)] *= 20 if word.text == "drawer" else 1
+        return rows / rows.sum(axis=-1, keepdims=True)
+
+    families = {task: f"kind {task}" for task in range(5)}
+    store = write_store(tmp_path / "a.zarr", tasks=tuple(range(5)), episodes=4, plant_rows=read_drawer,
+                        task_families=families)  # fmt: skip
+    question = question_about(store)
+    found = words(question)
+    numbers = found.findings[0].numbers
+    assert (numbers["word"], numbers["these"] >= 1) == ("drawer", True)
+    row = found["words"].row(by_predicate=(pl.col("item") == "drawer") & (pl.col("kind") == "word"), named=True)
+    assert (row["intervals"], row["num_tasks"] < 4) == ("these-tasks", True)
+    assert numbers["estimate"] == row["lift"] > 10
+    assert found.findings[0] in language(question).findings
+
+
+def test_one_table_has_one_sentence():
+    question = question_about(example_store("cubes"))
+    own = words(question).findings[0]
+    assert own in language(question).findings
+    named = words(question)["words"].filter(pl.col("kind") == "word", pl.col("lift_q") <= SHOWN_AT)
+    assert own.numbers["these"] == named.height == 4
+
+
+def test_what_was_not_shown_says_what_would_have_been(tmp_path):
+    """Of even attention with noise: the detectable lift lies beyond the intervals of the words."""
+
+    def even(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+        return random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode, spread=0.5)
+
+    found = words(question_about(write_store(tmp_path / "a.zarr", episodes=4, plant_rows=even)))
+    numbers, table = found.findings[0].numbers, found["words"].filter(kind="word")
+    assert "word" not in numbers
+    reach = (table["lift_high"] / table["lift"]).drop_nulls().median()
+    assert numbers["detectable"] > reach > 1
+    assert "lift_detectable" not in table.columns
 
 
 @pytest.mark.drawn

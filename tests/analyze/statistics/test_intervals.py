@@ -48,6 +48,20 @@ def test_one_task_is_students_interval_over_its_episodes(estimand, level):
     assert logs.p_value(3.0) == pytest.approx(stats.ttest_1samp(np.log(SAMPLE), np.log(3.0)).pvalue)
 
 
+@pytest.mark.parametrize("degrees", [2, 24])
+def test_a_truth_that_is_detectable_is_shown_in_the_given_part_of_runs(degrees):
+    """By drawing: t tests of samples whose mean is the detectable truth, with the scatter that the sample has."""
+    generator, n = np.random.default_rng(0), degrees + 1
+    sample = generator.normal(0, 1.0, n)
+    estimate = one(mean_over_episodes((sample - sample.mean()) / sample.std(ddof=1)), np.zeros(n))
+    truth = estimate.detectable(0.0, level=0.05, power=0.8)
+    assert truth == pytest.approx((stats.t.ppf(0.975, degrees) + stats.t.ppf(0.8, degrees)) / np.sqrt(n))
+    shown = stats.ttest_1samp(generator.normal(truth, 1.0, (20_000, n)), 0.0, axis=1).pvalue <= 0.05
+    assert shown.mean() == pytest.approx(0.8, abs=0.02 if degrees > 10 else 0.15)
+    logs = one(geometric_mean_over_episodes(sample), np.zeros(n))
+    assert np.log(logs.detectable(2.0)) - np.log(2.0) == pytest.approx(truth * sample.std(ddof=1))
+
+
 def test_tasks_like_these_is_the_t_interval_over_task_means():
     values = np.random.default_rng(1).normal(UNBALANCED, 1.0)
     means = np.array([values[task == UNBALANCED].mean() for task in range(6)])
