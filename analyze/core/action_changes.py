@@ -102,7 +102,7 @@ class ActionUnits:
 
     def size(self, value: float, text: str = "") -> str:
         """The first part with a value, which is rounding below `ROUNDING`; text: the value, with an interval for it."""
-        return self.said((text or f"{value:.2g}") if value >= ROUNDING else f"less than {ROUNDING:g}")
+        return self.said(text if text and value >= ROUNDING else small_size(value))
 
     @property
     def further_columns(self) -> list[Column]:
@@ -130,6 +130,11 @@ class ActionUnits:
     def chunk_change(self, base: BaseEpisode, actions: Array) -> Array:
         """The change (replan,) of the first part over whole chunks, whatever of them was executed."""
         return self.parts[0].of(base.actions, actions, np.full(len(actions), actions.shape[1]))
+
+
+def small_size(value: float) -> str:
+    """A value, which is rounding below `ROUNDING`."""
+    return f"{value:.2g}" if value >= ROUNDING else f"less than {ROUNDING:g}"
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns, f
 from vla_attention.analyze.measures.not_in_memory import OnDisk
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_episode, vocabulary_of
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
@@ -144,7 +145,8 @@ def summary_of(
     Returns:
         looks, `NAMES`, num_episodes, num_tasks; the values of `episodes`; over_noise, the mean effect / that of another
         noise seed. times_noise_q (of no difference from another noise seed), gripper_minus_noise_q and lift_q are
-        adjusted for the conditions of a cell with the same reader, without those of random keys.
+        adjusted for the conditions of a cell with the same reader, without those of random keys; times_noise_detectable
+        is what would have been shown in 80 % of runs of this size, if it were the only one.
     """
     # What is named is one row an item: of its total effect, or where that was not tried of the direct one.
     reader = pl.col("reader").fill_null("total")
@@ -152,9 +154,12 @@ def summary_of(
     values = {name: scale for name, scale in (units.scales | _VALUES).items() if name in episodes.columns}
     # By the effect or by the gripper an item is named.
     nulls = {"lift": 1.0} | {name: 0.0 for name in ("times_noise", "gripper_minus_noise") if name in values}
+    rows = episodes.with_columns(_look=look)
+    num_looks = max(rows.group_by("_look").agg(pl.n_unique("condition"))["condition"].to_list(), default=1)
     found = estimate(
-        episodes.with_columns(_look=look), [*looks, *NAMES, "_look"], values, sampling, nulls, [*looks, "_look"],
-        {"over_noise": (EFFECT, "noise")}, [name for name in nulls if name != "lift"],
+        rows, [*looks, *NAMES, "_look"], values, sampling, nulls, [*looks, "_look"], {"over_noise": (EFFECT, "noise")},
+        [name for name in nulls if name != "lift"],
+        {"times_noise": NAMED_AT / num_looks} if "times_noise" in nulls else None,
     )  # fmt: skip
     known = pl.col("_look") != "random"
     found = found.with_columns(pl.when(known).then(f"{name}_q").alias(f"{name}_q") for name in nulls).drop("_look")

@@ -29,7 +29,7 @@ from vla_attention.analyze.commands.effects.items import (
 from vla_attention.analyze.commands.effects.prompts import other_sentences
 from vla_attention.analyze.commands.effects.ways import unlike_attention, ways_of_words
 from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes, with_interval
-from vla_attention.analyze.core.action_changes import ActionUnits
+from vla_attention.analyze.core.action_changes import ActionUnits, small_size
 from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.recorded_effects import ITEM, RecordedEffects, recorded_effects, summary_of
@@ -148,6 +148,7 @@ def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> 
         said += f" Also more than noise: {named_sizes(far[1:])}." if far.height > 1 else ""
     elif few.height < tested.height:
         said = f"No word is shown to do more than another noise seed. Most without {top['label']}: {size}{noise}."
+        limits += _would_be_shown(tested, units)
     else:
         said = f"{_without(top)} {size}{noise}, in these episodes."
         said += f" Next: {named_sizes(tested[1:])}." if tested.height > 1 else ""
@@ -155,12 +156,23 @@ def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> 
     if few.height:
         limits.insert(0, f"Too few episodes to say more of {listing(few['label'], MOST_NAMED)}.")
     if held.height:
-        pairs = [f"{row['label']} ({row['effect']:.2g}; exchanged {row['exchanged']:.2g})" for row in held.to_dicts()]
+        pairs = [
+            f"{row['label']} ({row['effect']:.2g}; exchanged {small_size(row['exchanged'])})" for row in held.to_dicts()
+        ]
         limits.insert(0, f"Not counted, since another word in its place is not shown to do anything: "
                          f"{listing(pairs, MOST_NAMED)}.")  # fmt: skip
     numbers = {"word": top["item"], "estimate": top["effect"], "low": top["effect_low"], "high": top["effect_high"],
                "noise": top["noise"], "shown": sure.height, "tested": tested.height}  # fmt: skip
     return Finding(said, _MISSING, numbers, " ".join(limits))
+
+
+def _would_be_shown(words: pl.DataFrame, units: ActionUnits) -> list[str]:
+    """Without how large an effect of a word nothing would have been shown, of the median word."""
+    sizes = words.select(pl.col("noise") * pl.col("detectable").exp()).to_series().drop_nulls().to_list()
+    if not sizes:
+        return []
+    size = units.said(f"{sorted(sizes)[len(sizes) // 2]:.2g}")
+    return [f"A word without which {size} is shown in 80% of runs of this size."]
 
 
 def _without(row: Mapping[str, Any]) -> str:

@@ -58,7 +58,8 @@ def by_item(summary: pl.DataFrame, units: ActionUnits, looks: Sequence[str] = ()
     gripper = gripper if "gripper_minus_noise_q" in summary.columns else {}
     found = pl.concat([of_total, direct]).select(
         *names, "condition", "reader", *_with_ends("effect"), *units.names[1:], "lift", "lift_q", "noise",
-        than_noise=against_noise(bool(gripper)), q="times_noise_q", num_episodes="num_episodes", **gripper,
+        than_noise=against_noise(bool(gripper)), q="times_noise_q", detectable="times_noise_detectable",
+        num_episodes="num_episodes", **gripper,
     )  # fmt: skip
     for reader in _READERS:
         part = rows.filter(reader=reader).select(*names, *_with_ends("effect", reader))

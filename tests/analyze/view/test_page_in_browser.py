@@ -130,7 +130,7 @@ def test_an_item_of_the_effects_is_taken_away_by_a_click_or_a_key(browser):
             watched.page.locator(".shades").get_by_text(words).click()
             texts = watched.page.locator(f".effects td:nth-child({column})").all_inner_texts()
             assert [float(text) for text in texts] == sorted(map(float, texts), reverse=True)
-        tried = {one["item"] for one in items if one["kind"] in ("without", "noise")}
+        tried = {one["label"] for one in items if one["kind"] in ("without", "noise")}
         assert rows.count() == len(tried)
         assert watched.page.locator(".actions .chunk.without").count() == 0
         for item in tried - {"another noise seed"}:
