@@ -223,9 +223,23 @@ FAULTS = (
     Fault(
         "attention elsewhere: an episode's own places count as other ones",
         "analyze/core/object_maps.py",
-        "for name in _names(one)], axis=-1) - one.area",
+        "for name in _names(one)], axis=-1) - own",
         "for name in _names(one)], axis=-1)",
         (f"{CORE}/test_object_maps.py",),
+    ),
+    Fault(
+        "naming: what a task's own episodes do not name counts as another task's",
+        "analyze/core/naming.py",
+        "(mean.sum(axis=1)[strata] - mean[strata, tasks]) / (there.sum(axis=1)[strata] - there[strata, tasks])",
+        "mean.sum(axis=1)[strata] / there.sum(axis=1)[strata]",
+        (f"{CORE}/test_naming.py",),
+    ),
+    Fault(
+        "left out: an episode of a task has all of what the statistic loses",
+        "analyze/statistics/left_out.py",
+        "part.num_tasks * (size - 1)[part.tasks]",
+        "part.num_tasks * size[part.tasks]",
+        ("tests/analyze/statistics/test_left_out.py",),
     ),
     Fault(
         "masked softmax: a query that its mask leaves no key sees all",

@@ -62,7 +62,8 @@ def of_objects(question: Question, named: Naming, row: dict[str, Any]) -> Findin
     )
     said = f"at the first policy call they get {times(row, 'over_area')} the attention that their area would give"
     said += f", {times(row, 'over_place')} what their places explain" if place else ""
-    why = "no object that one sentence names and another does not is in sight of both"
+    why = "no sentence names a thing that another task shows and does not name"
+    why = why if place else "no task has two episodes, so what places explain is not known"
     why = f"{listing(named.always)}: always named in this suite" if named.always else why
     limit = f"Whether it looks for what is named is not known: {why}. {enough(question)}".strip()
     return Finding(f"{verdict}: {said}.", ASKS, {"shown": 0, **row}, limit)

@@ -105,19 +105,20 @@ def naming(
         found: their `object_maps`, heads and layers together; read here where they are needed, unless given.
     """
     cases = _cases(question)
+    kinds = by_kind(cases.with_columns(camera=pl.lit(ALL_CAMERAS), x=pl.lit(0.0)))
+    always = tuple(kinds.filter(pl.col("named").all().over("suite", "item"))["item"].unique().sort())
     shares = first_calls(measure_objects(question) if measured is None else measured)
     x = shares.select(*EPISODE_ID, "camera", "item", x=pl.col("share").log())
-    same_state = cases.filter(pl.col("state") != "").with_columns(
-        stratum=pl.concat_str("suite", "state", separator=" ")
-    )
-    one = _compared(question, "same state", same_state.join(x, on=[*EPISODE_ID, "item"]))
+    states = cases.filter(pl.col("state") != "").join(x, on=[*EPISODE_ID, "item"])
+    states = states.with_columns(stratum=pl.concat_str("suite", "state", separator=" "))
+    one = _compared(question, "same state", states, always)
     if one.form is not None or cases.is_empty():
         return one
     found = object_maps(question, heads=False, layers=False, iou=False) if found is None else found
     x = over_place(question, found).filter(kind="object", layer=LAYERS_AVG)
     x = x.select(*EPISODE_ID, "camera", "item", x=(pl.col("at_place") / pl.col("elsewhere")).log())
     kinds = by_kind(cases.join(x, on=[*EPISODE_ID, "item"]))
-    return _compared(question, "other tasks", kinds.with_columns(stratum=pl.col("suite")))
+    return _compared(question, "other tasks", kinds.with_columns(stratum="suite"), always)
 
 
 def named_in(question: Question) -> list[Naming]:
@@ -153,19 +154,17 @@ def by_kind(rows: pl.DataFrame) -> pl.DataFrame:
     return rows.group_by(*EPISODE_ID, "camera", "item", maintain_order=True).agg(pl.col("named").any(), x)
 
 
-def _compared(question: Question, form: Form, rows: pl.DataFrame) -> Naming:
+def _compared(question: Question, form: Form, rows: pl.DataFrame, always: tuple[str, ...]) -> Naming:
     """Named against not named within strata: EPISODE_ID, stratum, camera, item, named, x."""
-    parts, episodes, seen = [], [], set[str]()
+    parts, episodes = [], []
     for camera, part in rows.group_by("camera", maintain_order=True):
         one = _Cells.of(question, part)
         shown = [i for i, column in enumerate(np.isfinite(one.found()).T) if column.any()]
-        seen |= {one.items[i] for i in shown}
         for name, chosen in ((ALL_NAMED, shown), *((one.items[i], [i]) for i in shown)) if shown else ():
             logs = pseudo_values(partial(one.statistic, chosen), one.units)
             parts.append(one.rows(logs).with_columns(camera=pl.lit(camera[0]), item=pl.lit(name)))
         if camera[0] == ALL_CAMERAS:
             episodes.append(one.rows(finite_mean(one.found(), axis=1)))
-    always = tuple(sorted({*rows.filter("named")["item"]} - seen))
     if not parts:
         return Naming(None, pl.DataFrame(), pl.DataFrame(), always)
     table = pl.concat(parts).with_columns(ratio=pl.col("log_ratio").exp(), whole=pl.col("item") == ALL_NAMED)
