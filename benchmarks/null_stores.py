@@ -6,6 +6,8 @@
 In a null store every key's attention is the same in expectation; tasks, episodes and keys scatter around it. The nulls:
 
     analyze   neither pictures nor text get more attention per token
+    outcome   (analyze --by outcome) attention does not depend on whether an episode is solved
+    time      (analyze --by time) nor on whether something was touched already
     words     every word has the same lift in every layer and head; "words here": tasks do not differ, and sentences
               about these tasks count too
     objects   attention does not depend on where the objects are
@@ -37,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import vla_attention as va
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
-from tests.kit.stores import StoreSpec, write_store
+from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.analyze.commands.effects.answer import deciding
 from vla_attention.analyze.commands.effects.items import by_item
 from vla_attention.analyze.core.action_changes import ActionSpread
@@ -89,6 +91,10 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
             for span in tokens.layout.spans:
                 if span.camera in (tokens.coverage or {}):
                     factor[:, span.start : span.stop] += (FACTOR**3 - 1) * tokens.coverage[span.camera][:, :, 0]
+        elif kind == "outcome":
+            factor = np.where(image & (episode % 2 == 0), FACTOR, 1.0) * factor
+        elif kind == "time":
+            factor[len(made) // 2 :] = np.where(image[0] if image.ndim > 1 else image, FACTOR, 1.0)
         elif kind == "analyze" or seed % 2:  # compare: the second run
             factor = np.where(image, FACTOR, 1.0)
         return normalised(made * (factor[:, None, None, None, None, :] if planted else 1.0))
@@ -112,7 +118,14 @@ SPEC = StoreSpec(
 
 def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool:
     """Whether a sentence of the first screen about one store, or about two, names something; read from its numbers."""
-    spec = replace(SPEC, frames=False, coverage=kind in ("objects", "compare"), mantissa_bits=23, seed=number)
+    spec = replace(
+        SPEC,
+        plant_steps=small_steps if kind == "time" else None,
+        frames=False,
+        coverage=kind in ("objects", "compare"),
+        mantissa_bits=23,
+        seed=number,
+    )
     paths = []
     for run in range(2 if kind == "compare" else 1):
         own = replace(spec, plant_rows=plant_of(kind, 2 * number + run, planted))
@@ -125,6 +138,8 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
     if kind == "objects":
         q = store.objects(iou=False).findings[0].numbers["over_place_q"]
         return q is not None and float(q) <= LEVEL
+    if kind in ("outcome", "time"):
+        return bool(store.analyze(by=kind).findings[0].numbers["shown"])
     if kind == "analyze":
         numbers = store.analyze().findings[0].numbers
         return not float(numbers["ratio_lift_low"]) <= 1 <= float(numbers["ratio_lift_high"])
@@ -287,7 +302,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    kinds = ["analyze", "words", "words here", "objects", "compare", "language", "language_test", "effects"]
+    kinds = [
+        "analyze",
+        "outcome",
+        "time",
+        "words",
+        "words here",
+        "objects",
+        "compare",
+        "language",
+        "language_test",
+        "effects",
+    ]
     parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"
