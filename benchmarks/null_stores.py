@@ -6,6 +6,8 @@
 In a null store every key's attention is the same in expectation; tasks, episodes and keys scatter around it. The nulls:
 
     analyze   neither pictures nor text get more attention per token
+    outcome   (analyze --by outcome) attention does not depend on whether an episode is solved
+    time      (analyze --by time) nor on whether something was touched already
     words     every word has the same lift in every layer and head; "words here": tasks do not differ, and sentences
               about these tasks count too
     compare   two runs of the same distribution, paired by initial state
@@ -37,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import vla_attention as va
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
 from tests.kit.planted_effects import FIRST, planted_effects
-from tests.kit.stores import StoreSpec, write_store
+from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.core.listening import IN_PART, LISTENS_TO_ALL, listens
 from vla_attention.analyze.statistics.many_looks import SHOWN_AT
@@ -80,6 +82,10 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
             for piece in tokens.prompts[tokens.prompt_index[0]].pieces:
                 if piece.text.strip() == "the":
                     factor[:, piece.key] = FACTOR**4
+        elif kind == "outcome":
+            factor = np.where(image & (episode % 2 == 0), FACTOR, 1.0) * factor
+        elif kind == "time":
+            factor[len(made) // 2 :] = np.where(image[0] if image.ndim > 1 else image, FACTOR, 1.0)
         elif kind == "analyze" or seed % 2:  # compare: the second run
             factor = np.where(image, FACTOR, 1.0)
         return normalised(made * (factor[:, None, None, None, None, :] if planted else 1.0))
@@ -103,7 +109,8 @@ SPEC = StoreSpec(
 
 def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool:
     """Whether a sentence of the first screen about one store, or about two, names something; read from its numbers."""
-    spec = replace(SPEC, frames=False, coverage=kind == "compare", mantissa_bits=23, seed=number)
+    steps = small_steps if kind == "time" else None
+    spec = replace(SPEC, plant_steps=steps, frames=False, coverage=kind == "compare", mantissa_bits=23, seed=number)
     paths = []
     for run in range(2 if kind == "compare" else 1):
         own = replace(spec, plant_rows=plant_of(kind, 2 * number + run, planted))
@@ -113,6 +120,8 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
         numbers = store.words().findings[0].numbers
         # Where tasks differ, a word of one of them may well be read more in it.
         return bool(numbers.get("like_these")) or (kind == "words here" and bool(numbers.get("these")))
+    if kind in ("outcome", "time"):
+        return bool(store.analyze(by=kind).findings[0].numbers["shown"])
     if kind == "analyze":
         numbers = store.analyze().findings[0].numbers
         return not float(numbers["ratio_lift_low"]) <= 1 <= float(numbers["ratio_lift_high"])
@@ -283,7 +292,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    kinds = ["analyze", "words", "words here", "compare", "language", "language_test", "effects"]
+    kinds = ["analyze", "outcome", "time", "words", "words here", "compare", "language", "language_test", "effects"]
     parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import polars as pl
 
@@ -13,7 +13,6 @@ from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.holdings import holdings, overlaps_of
 from vla_attention.analyze.core.about import (
     GROUP_COLUMNS,
-    NORM_COLUMNS,
     RATIO_COLUMNS,
     about,
     enough,
@@ -23,11 +22,12 @@ from vla_attention.analyze.core.about import (
     out_of,
     sides,
     with_interval,
+    would_show,
 )
 from vla_attention.analyze.core.axes import COLUMNS, check_axes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
-from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
-from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
+from vla_attention.analyze.core.contributions import tables_of_norms
+from vla_attention.analyze.core.levels import Levels, detectable_lift, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.listening import listens
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.sinks import SinkRule, search_sinks
@@ -36,9 +36,11 @@ from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.published.plot_evolution import evolution_files
 from vla_attention.analyze.published.results_writer import results_files
+from vla_attention.analyze.statistics.intervals import says_a_size
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 
+_Row: TypeAlias = Mapping[str, Any]
 AVERAGE = pl.col("layer") == LAYERS_AVG
 _NUMBERS = ("geometric_mean", "geometric_mean_low", "geometric_mean_high", "uniform_ratio", "ratio_lift",
             "ratio_lift_low", "ratio_lift_high", "num_episodes", "num_tasks", "episodes_with_ratio",
@@ -81,7 +83,6 @@ def analyze(
     cell = overall(tasks).filter(AVERAGE).row(0, named=True)
     has_ratio = question.grouping.ratio is not None
     part = only(question, episodes.filter(AVERAGE, pl.col("log_ratio_mean").is_finite())) if has_ratio else question
-    norms, of_group_norms = side_norms(question), group_norms(question)
     files = results_files(levels) if has_ratio and not question.of_other_loop else {}
     if save_viz:
         files |= evolution_files(levels)
@@ -89,12 +90,12 @@ def analyze(
         "Looks or reads?" if question.grouping.compares_modalities else "Where attention goes",
         about(question),
         [
-            *(_of_ratio(question, part, rows, cell) if has_ratio else [_of_fractions(question, rows)]),
+            *(_of_ratio(question, part, rows, cell, episodes) if has_ratio else [_of_fractions(question, rows)]),
             *_of_words(question),
         ],
         [
             *_shown_tables(question, tasks, groups, shown),
-            *_tables_of_norms(question, norms, of_group_norms),
+            *tables_of_norms(question),
             Table("episodes", episodes),
             Table("episodes_groups", of_groups),
             Table("steps", levels.steps()),
@@ -135,21 +136,7 @@ def _shown_tables(question: Question, tasks: pl.DataFrame, groups: pl.DataFrame,
     return [*found, Table("tasks", tasks, of_tasks if several else (), "Tasks", AVERAGE & (pl.col("scope") == "task"))]
 
 
-def _tables_of_norms(question: Question, norms: Norms | None, of_groups: Norms | None) -> list[Table]:
-    """What pictures, text and groups add to the residual stream, where it was recorded."""
-    tables = []
-    if norms is not None:
-        ratios = norms.ratios(question.sampling)
-        tables = [Table("contributions", ratios, NORM_COLUMNS, "What the tokens add", AVERAGE)]
-        tables.append(Table("contributions_steps", norms.cells()))
-    if of_groups is not None:
-        tables.append(Table("group_contributions", of_groups.norms()))
-        if of_groups.above:
-            tables.append(Table("group_contribution_ratios", of_groups.cells()))
-    return tables
-
-
-def _of_fractions(question: Question, rows: Mapping[str, Mapping[str, Any]]) -> Finding:
+def _of_fractions(question: Question, rows: Mapping[str, _Row]) -> Finding:
     """The groups that get most attention, for a grouping without a ratio."""
     most = sorted((row for row in rows.values() if row["fraction"]), key=lambda row: -row["fraction"])
     said = ", ".join(f"{row['group']} {row['fraction']:.0%}" for row in most[:5])
@@ -159,7 +146,7 @@ def _of_fractions(question: Question, rows: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def _of_ratio(
-    question: Question, part: Question, rows: Mapping[str, Mapping[str, Any]], cell: Mapping[str, Any]
+    question: Question, part: Question, rows: Mapping[str, _Row], cell: _Row, episodes: pl.DataFrame
 ) -> list[Finding]:
     """How attention is divided between both sides, and token by token; then the ratio itself.
 
@@ -170,9 +157,8 @@ def _of_ratio(
     shares = [sum(rows[name]["fraction"] or 0.0 for name in side) for side in sides(grouping)]
     asks = "Looks or reads?" if compares else "Where does attention go?"
     sentence = f"{shares[0]:.0%} of the attention goes to {above}, {shares[1]:.0%} to {below}."
-    numbers = {"numerator_fraction": shares[0], "denominator_fraction": shares[1]} | {
-        name: cell[name] for name in _NUMBERS
-    }
+    numbers = dict(zip(("numerator_fraction", "denominator_fraction"), shares, strict=True))
+    numbers |= {name: cell[name] for name in _NUMBERS}
     limit, some = enough(part), out_of(part, question)
     if cell["geometric_mean"] is None:
         none = f"In none of {plural(len(question.selected), 'episode')} do both get some: there is no ratio."
@@ -184,6 +170,9 @@ def _of_ratio(
     if cell["ratio_lift"] is None or cell["uniform_ratio"] is None:
         return [Finding(f"{sentence} {ratio}.", asks, numbers, limit)]
     even = f"attention spread evenly over all tokens would give {cell['uniform_ratio']:.3g}"
+    low, high = cell["ratio_lift_low"], cell["ratio_lift_high"]
+    if low is not None and low <= 1 <= high:
+        limit = f"{would_show(detectable_lift(episodes, question.sampling))} {limit}".strip()
     if cell["ratio_of_means"] is not None:  # what the parts above give
         ratio += f" (geometric mean over layers and calls; of all attention together {cell['ratio_of_means']:.3g})"
     return [
@@ -192,7 +181,7 @@ def _of_ratio(
     ]
 
 
-def _token_by_token(question: Question, cell: Mapping[str, Any], above: str, below: str) -> str:
+def _token_by_token(question: Question, cell: _Row, above: str, below: str) -> str:
     """Which side a single token gets more attention on; nothing is claimed that the interval does not show."""
     compares, lift = question.grouping.compares_modalities, [cell[f"ratio_lift{end}"] for end in ("", "_low", "_high")]
     one, other = ("an image patch", "a token of the text") if compares else (f"one of {above}", f"one of {below}")
@@ -200,7 +189,7 @@ def _token_by_token(question: Question, cell: Mapping[str, Any], above: str, bel
     if lift[0] < 1:  # the side that gets more stands first
         one, other, verb, lift = other, one, "reads", inverse(*lift)
     value, low, high = lift
-    bounds = "" if low is None else f" [{low:.2g}, {high:.2g}]"
+    bounds = f" [{low:.2g}, {high:.2g}]" if low is not None and says_a_size(low, high) else ""
     gets = f"{one} gets {value:.2g} times the attention of {other}{bounds}"
     if low is None:
         return f"Token by token, {gets}; without an interval nobody knows whether that is more."
@@ -209,7 +198,7 @@ def _token_by_token(question: Question, cell: Mapping[str, Any], above: str, bel
     return f"Token by token, {gets}." if question.untrained or not compares else f"Token by token it {verb}: {gets}."
 
 
-def _notes(levels: Levels, cell: Mapping[str, Any]) -> list[str]:
+def _notes(levels: Levels, cell: _Row) -> list[str]:
     """What a named grouping is, and what the ratio leaves out or counts twice."""
     grouping = levels.grouping
     named = bool(levels.question.settings.grouping not in (None, "default") and grouping.description)
@@ -251,6 +240,6 @@ def _figures(
     spread = episodes.sort("layer_number", nulls_last=True).with_columns(pl.col("layer").replace(LAYERS_AVG, "all"))
     title, boxes = (
         f"Ratio {name} of single episodes, by layer",
-        "Dots: episodes. Boxes: quartiles; whiskers: 5% to 95%.",
+        "Dots: episodes; boxes: quartiles; whiskers: 5% to 95%.",
     )
     return [*found, Figure("ratio_distribution", "distribution", spread, title, boxes, {**along, "x": "layer"})]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import polars as pl
@@ -19,6 +20,7 @@ from vla_attention.analyze.core.about import (
     with_interval,
 )
 from vla_attention.analyze.core.axes import columns_of, with_families
+from vla_attention.analyze.core.between_parts import of_outcome, of_time
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.levels import Levels, groups_by, ratios_by
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
@@ -28,6 +30,8 @@ from vla_attention.schemas.errors import plural
 _RATIOS: dict[str, Scale] = {"ratio": "geometric", "uniform_ratio": "geometric", "ratio_lift": "geometric",
                              "numerator_fraction": "share", "denominator_fraction": "share"}  # fmt: skip
 _GROUPS: dict[str, Scale] = {"fraction": "share", "lift": "positive", "keys": "plain"}
+#: Axes that stand alone and whose rows are compared.
+_COMPARED = {"outcome": of_outcome, "time": of_time}
 #: How an axis is drawn along x: its column, and its name.
 _ALONG = {
     "time": ("phase", "time (0: first replan, 1: end)"),
@@ -62,7 +66,7 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
             *columns,
             Column("ratio", "factor", "ratio", RATIO_COLUMNS[0].meaning),
             *RATIO_COLUMNS[1:],
-            Column("ratio_lift_q", "p", "q", "p of no difference per token, adjusted for the number of rows"),
+            Column("ratio_lift_q", "p", "q of even", "p of even attention per token, adjusted for the number of rows"),
             Column("episodes_with_ratio", "count", "episodes"),
         )
         tables.append(Table("by", ratios.sort(order, nulls_last=True), shown, title, rows=24))
@@ -73,12 +77,21 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
     of_groups = Table(
         "by_groups", groups, (*columns, *GROUP_COLUMNS), f"{title}: groups", pl.col("group").is_in(having), 24
     )
+    tables.append(of_groups)
+    drawn, alone = tables, next(iter(by)) if len(by) == 1 else ""
+    if alone in _COMPARED:
+        finding, first = _COMPARED[alone](levels)
+        finding = replace(finding, limit=f"{finding.limit} {enough(part)}".strip())
+    else:
+        finding, first = _finding(levels, part, tables, columns, by), []
+    if alone == "time":  # a picture shows twenty moments better than twenty rows
+        tables = [replace(table, columns=()) for table in tables]
     return Result(
         f"Where attention goes, by {' and '.join(by)}",
         about(question),
-        [_finding(levels, part, [*tables, of_groups], columns, by)],
-        [*tables, of_groups, *_steps(levels), *_replans(levels, by), *more],
-        _figures(levels, [*tables, of_groups], axes),
+        [finding],
+        [*first, *tables, *_steps(levels), *_replans(levels, by), *more],
+        _figures(levels, drawn, axes),
         notes(part),
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes
+from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes, would_show
 from vla_attention.analyze.core.axes import OF_ROWS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.measure import measure, table_of
@@ -148,12 +148,7 @@ def _nothing_named(words: pl.DataFrame, limit: str) -> tuple[str, str, dict[str,
     """Sentence, question, numbers and limit: how much a run of this size would have shown."""
     known = words["lift_detectable"].drop_nulls().to_list()
     tested = words["lift_q"].len() - words["lift_q"].null_count()
-    could = "One episode of a word has no interval: record more episodes."
-    if known:
-        times = median(known)
-        could = (
-            f"So many episodes show a word in 80% of runs that gets {times:.2g} times its share, or {1 / times:.2g}."
-        )
+    could = would_show(median(known)) if known else "One episode of a word has no interval: record more episodes."
     verdict = f"No word is shown to get more, or less, than its share of attention ({plural(tested, 'word')} tested)."
     numbers: dict[str, float | int | str | None] = {"tested": tested, "detectable": median(known) if known else None}
     return verdict, "Which words are read?", numbers, f"{could} {limit}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -14,6 +15,7 @@ from vla_attention.analyze.core.result import Column
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.task_families import unknown_families
+from vla_attention.analyze.statistics.intervals import says_a_size
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -40,14 +42,6 @@ RATIO_COLUMNS = (
     ),
     Column("uniform_ratio", "number", "if even", "the ratio if attention were spread evenly over all tokens"),
     Column("ratio_lift", "factor", "per token", "ratio / ratio if even"),
-)
-NORM_COLUMNS = (
-    Column("layer", "text"),
-    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
-    Column("linguistic_norm", "number", "text"),
-    Column("geometric_mean", "factor", "ratio"),
-    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
-    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
 )
 
 
@@ -163,6 +157,17 @@ def inverse(value: float, low: float | None, high: float | None) -> list[float |
 
 
 def with_interval(row: Mapping[str, Any], name: str) -> str:
-    """`2.89 [2.13, 3.93]`; the value alone without an interval."""
+    """`2.89 [2.13, 3.93]`; the value alone without an interval, and where the ends of a ratio's are worlds apart."""
     low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return f"{row[name]:.3g}" + ("" if low is None else f" [{low:.3g}, {high:.3g}]")
+    if low is None:
+        return f"{row[name]:.3g}"
+    if not says_a_size(low, high):
+        return f"{row[name]:.3g} (no interval: too few episodes for how they differ)"
+    return f"{row[name]:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def would_show(factor: float | None) -> str:
+    """What a run of this size would have shown, as a sentence: of `Estimate.detectable` of a ratio; empty for None."""
+    if factor is None or not math.isfinite(factor):
+        return ""
+    return f"A run of this size shows {factor:.3g} times, or {1 / factor:.2g} times, with a chance of 80%."

@@ -32,6 +32,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.result import Column, Table
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Axis, frame_of_episodes, long_table
 from vla_attention.analyze.measures.masses import finite_mean, ratio, uniform_keys, uniform_masses
 from vla_attention.analyze.measures.not_in_memory import OnDisk
@@ -51,6 +52,14 @@ VISUAL_ROLES = ("image",)
 LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
 _SIDES = ("visual_norm", "linguistic_norm")
 _RATIOS = ("contribution_ratio", "uniform_ratio", "ratio_lift")
+_COLUMNS = (
+    Column("layer", "text"),
+    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
+    Column("linguistic_norm", "number", "text"),
+    Column("geometric_mean", "factor", "ratio"),
+    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
+    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
+)
 #: An episode, and the arrays of its norms.
 _Episode: TypeAlias = tuple[SelectedEpisode, Mapping[str, Any]]
 
@@ -334,3 +343,17 @@ def _groups_of_episode(item: SelectedEpisode, selection: Selection, site: str, g
         )
         found |= {"numerator_norm": above[0], "denominator_norm": below[0], **ratio_columns(above, below)}
     return found
+
+
+def tables_of_norms(question: Question) -> list[Table]:
+    """What pictures, text and groups add to the residual stream, where it was recorded."""
+    tables = []
+    if (norms := side_norms(question)) is not None:
+        ratios, average = norms.ratios(question.sampling), pl.col("layer") == LAYERS_AVG
+        tables = [Table("contributions", ratios, _COLUMNS, "What the tokens add", average)]
+        tables.append(Table("contributions_steps", norms.cells()))
+    if (of_groups := group_norms(question)) is not None:
+        tables.append(Table("group_contributions", of_groups.norms()))
+        if of_groups.above:
+            tables.append(Table("group_contribution_ratios", of_groups.cells()))
+    return tables

@@ -30,6 +30,7 @@ from vla_attention.analyze.core.measure import Items, Measured, measure, table_o
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_not_empty, resolve_episode
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
@@ -374,6 +375,14 @@ _VALUES: dict[str, Any] = {
 _QUOTIENTS = {"ratio_of_means": ("numerator_mass", "denominator_mass")}
 #: Of these no interval is given.
 _UNBOUNDED = ("success_rate", "numerator_mass", "denominator_mass", "uniform_ratio")
+
+
+def detectable_lift(episodes: pl.DataFrame, sampling: Sampling) -> float | None:
+    """The least ratio over its even one that would have been shown to exceed 1, see `Estimate.detectable`."""
+    rows, one = episodes.filter(pl.col("layer") == LAYERS_AVG), {"ratio_lift": 1.0}
+    found = estimate(rows, ["layer"], {"ratio_lift": "geometric"}, sampling, one, detect={"ratio_lift": NAMED_AT})
+    least: float | None = found["ratio_lift_detectable"].item()
+    return least
 
 
 def task_groups(groups: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:

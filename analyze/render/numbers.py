@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vla_attention.analyze.core.result import Column
+from vla_attention.analyze.statistics.intervals import says_a_size
 
 
 def format_number(value: float | None) -> str:
@@ -26,7 +27,10 @@ def format_number(value: float | None) -> str:
 
 
 def cell(row: Mapping[str, Any], column: Column) -> str:
-    """A column's cell of a row, with its interval where the row has one: `18.2 [17.7, 18.7]`, `12.5% [10.1, 15.0]`."""
+    """A column's cell of a row, with its interval where the row has one: `18.2 [17.7, 18.7]`, `12.5% [10.1, 15.0]`.
+
+    `34.1 [any]`: the interval of a ratio from too few episodes, whose ends are worlds apart.
+    """
     value = row[column.name]
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
@@ -38,6 +42,8 @@ def cell(row: Mapping[str, Any], column: Column) -> str:
     shown = _shown(value, column.kind)
     if low is None or high is None:
         return shown
+    if column.kind == "factor" and not says_a_size(low, high):
+        return f"{shown} [any]"
     return f"{shown} [{', '.join(_shown(end, column.kind).rstrip('%') for end in (low, high))}]"
 
 

@@ -65,8 +65,16 @@ SHARE = (0.0, 1.0)
 _FEW, _SMALL_STRATUM = 5, 0.85
 #: A spread below this share of the values is rounding. Values without spread have no interval.
 ROUNDING = 1e-12
+#: An interval of a ratio with ends farther apart than by this factor says nothing of its size: it is not printed. From
+#: two units, half of the intervals are longer than 9 standard deviations, from three 3, from four 2.
+_WIDEST = 100.0
 #: Degrees of freedom this close to a whole number are that number.
 _WHOLE = 1e-9
+
+
+def says_a_size(low: float, high: float) -> bool:
+    """Whether the interval of a ratio is narrow enough to be printed."""
+    return not 0.0 <= low * _WIDEST < high
 
 
 class Interval(NamedTuple):

@@ -121,7 +121,7 @@ class Grouping:
 
 
 def read_grouping_file(path: Path) -> Grouping:
-    """Read a TOML grouping; every error names the file."""
+    """Read a TOML grouping; every error names the file. The rest is a group of its own, unless one takes it."""
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -136,12 +136,13 @@ def read_grouping_file(path: Path) -> Grouping:
             name: (selectors,) if isinstance(selectors, str) else tuple(selectors)
             for name, selectors in content.groups.items()
         }
+        whole, may_be_empty = _with_rest(groups)
         return Grouping(
             name=content.name or path.stem,
-            groups=groups,
+            groups=whole,
             ratio=content.ratio or conventional_ratio(groups),
             overlap=content.overlap,
-            allow_empty=content.allow_empty,
+            allow_empty=(*content.allow_empty, *may_be_empty),
             description=content.description,
         )
     except (MalformedDocument, GroupingError, SelectorError) as error:
@@ -184,11 +185,13 @@ def with_groups(base: Grouping | None, added: Iterable[tuple[str, str]]) -> Grou
     if base is not None:
         kept = {name: value for name, value in base.groups.items() if name not in selectors}
         return replace(base, name=f"{base.name}+{'+'.join(selectors)}", groups={**selectors, **kept})
-    if not any(value == (REST,) for value in selectors.values()) and "rest" not in selectors:
-        return Grouping(
-            name="+".join(selectors),
-            groups={**selectors, "rest": (REST,)},
-            ratio=conventional_ratio(selectors),
-            allow_empty=("rest",),
-        )
-    return Grouping(name="+".join(selectors), groups=selectors, ratio=conventional_ratio(selectors))
+    whole, may_be_empty = _with_rest(selectors)
+    return Grouping("+".join(selectors), whole, conventional_ratio(selectors), allow_empty=may_be_empty)
+
+
+def _with_rest(groups: Mapping[str, tuple[str, ...]]) -> tuple[Mapping[str, tuple[str, ...]], tuple[str, ...]]:
+    """The groups, and a group of the rest unless one takes it: fractions are of all tokens. And which may be empty."""
+    if any(value[:1] and value[0].strip() == REST for value in groups.values()) or not groups:
+        return groups, ()
+    name = next(name for name in ("rest", "other_tokens", "all_other_tokens") if name not in groups)
+    return {**groups, name: (REST,)}, (name,)
