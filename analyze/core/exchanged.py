@@ -13,6 +13,7 @@ import polars as pl
 from vla_attention.analyze.core.behaviour import ALONE
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
+from vla_attention.analyze.statistics.exact_tests import share_interval
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.words import folded_words, stop_words
@@ -115,6 +116,8 @@ def _finding(rates: pl.DataFrame, kinds: pl.DataFrame, left_out: int) -> Finding
         return Finding("No rollout of the exchange shows anything: every told goal held at the beginning.", _ASKS)
     right, n = other["right"], other["num_episodes"]
     ends = (other["did_told_low"], other["did_told_high"])
+    # All or none has no spread between tasks: the exact interval over these rollouts.
+    ends = share_interval(right, n) if right in (0, n) else ends
     interval = "" if None in ends else f" [{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %]"
     beside = f" (told the scene's own: {own['right']} of {own['num_episodes']})" if own else ""
     instead = f"; in {other['scenes']} it did the scene's own task" if other["scenes"] else ""

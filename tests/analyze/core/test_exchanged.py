@@ -88,6 +88,14 @@ def test_rates_are_of_the_rollouts_that_count(rollouts, found):
     assert rates[OWN]["did_scene"] is None
 
 
+def test_all_rollouts_right_have_an_exact_interval(rollouts):
+    right = [row | {"did": row["told"], "as_told": True, "left_out": None} for row in rollouts]
+    (finding,), _, _ = exchanged(pl.DataFrame(right, schema_overrides={**SCHEMA, "left_out": pl.String}), Sampling())
+    n = sum(row["task_id"] != row["scene_task_id"] for row in rollouts)
+    assert (finding.numbers["right"], finding.numbers["n"], finding.numbers["high"]) == (n, n, 1.0)
+    assert finding.numbers["low"] == pytest.approx(0.025 ** (1 / n))
+
+
 def test_words_are_compared_where_told_and_scene_differ(rollouts, found):
     number = {sentence: task for task, sentence in SENTENCES.items()}
     rows = {row["kind"]: row for row in found["exchange_kinds"].iter_rows(named=True)}
