@@ -12,7 +12,7 @@ from benchmarks.null_stores import names_something
 pytestmark = pytest.mark.thorough
 
 
-KINDS = ["analyze", "words", "words here", "compare"]
+KINDS = ["analyze", "outcome", "time", "words", "words here", "compare"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
