@@ -21,7 +21,7 @@ from vla_attention.analyze.core.levels import Levels, groups_by, ratios_by
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.statistics.intervals import Estimate
-from vla_attention.analyze.statistics.many_looks import NAMED_AT, adjusted_p_values
+from vla_attention.analyze.statistics.many_looks import SHOWN_AT, adjusted_p_values
 from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import plural
@@ -63,7 +63,7 @@ def of_outcome(levels: Levels) -> tuple[Finding, list[Table]]:
         said = "No task has both solved and failed episodes: whether they differ cannot be told from how tasks differ."
         return Finding(said, _OUTCOME, {"tasks_with_both": 0}, "Record more episodes of each task."), []
     found = _differences(both, levels.question.sampling)
-    numbers = {"tasks_with_both": tasks, "shown": found.filter(pl.col("q") <= NAMED_AT).height}
+    numbers = {"tasks_with_both": tasks, "shown": found.filter(pl.col("q") <= SHOWN_AT).height}
     where = f"within the {tasks} tasks that have both" if tasks > 1 else "within the one task that has both"
     which = "as large in solved episodes as in failed ones", "as much per token in solved episodes as in failed ones"
     sentence, limit = _said(found, values.ratio, which, f"Solved and failed episodes {{}}, {where}")
@@ -92,7 +92,7 @@ def _differences(both: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
 
 
 def _detectable(difference: Estimate, looks: int) -> float | None:
-    return difference.detectable(0.0, NAMED_AT / looks)
+    return difference.detectable(0.0, SHOWN_AT / looks)
 
 
 def _exp(value: float | None) -> float | None:
@@ -116,7 +116,7 @@ def of_time(levels: Levels) -> tuple[Finding, list[Table]]:
     looks = pairs.filter(pl.col("times").is_not_null()).select("item", "part").n_unique()
     found = estimate(
         with_families(pairs, question.sampling), ["item", "part"], {"amount": "geometric", "times": "geometric"},
-        question.sampling, {"times": 1.0}, detect={"times": NAMED_AT / max(1, looks)},
+        question.sampling, {"times": 1.0}, detect={"times": SHOWN_AT / max(1, looks)},
     ).rename({"times_q": "q", "times_detectable": "detectable"})  # fmt: skip
     order = {name: place for place, name in enumerate(names)}
     items = {name: place for place, name in enumerate([values.ratio, *levels.grouping.names])}
@@ -130,7 +130,7 @@ def of_time(levels: Levels) -> tuple[Finding, list[Table]]:
                             "Parts of the episodes {}", before)  # fmt: skip
     if untouched:
         limit = f"{limit} {plural(untouched, 'episode')} without a known touch left out.".lstrip()
-    numbers = {"shown": tested.filter(pl.col("q") <= NAMED_AT).height, "parts": len(names)}
+    numbers = {"shown": tested.filter(pl.col("q") <= SHOWN_AT).height, "parts": len(names)}
     table = Table("by_parts", found.drop("detectable"), _COURSE, "Along an episode", rows=10)
     return Finding(f"{course}. {sentence}", _TIME, numbers, limit), [table]
 
@@ -159,7 +159,7 @@ def _said(
 
     which: the end of a sentence about the ratio, and about a group, with the names of a part and of the one before it.
     """
-    shown = found.filter(pl.col("q") <= NAMED_AT).sort("q", "item")
+    shown = found.filter(pl.col("q") <= SHOWN_AT).sort("q", "item")
     if not shown.is_empty():
         said = []
         for row in shown.head(_MOST_NAMED).iter_rows(named=True):

@@ -14,7 +14,8 @@ import numpy as np
 #: A name is printed when its p-value is at most this, divided by the number of names that a text could print.
 NAMED_AT = 0.05
 #: Of what is done and of the words that are read, wherever they are named: the screen of `language` names three kinds
-#: of things, and `words` says of one table what it says (rates: benchmarks/README.md).
+#: of things, and `words` says of one table what it says. Also of outcomes and of parts of an episode, as several things
+#: are compared at once (rates: benchmarks/README.md).
 SHOWN_AT = NAMED_AT / 3
 
 
