@@ -316,7 +316,7 @@ def main() -> None:
             every = []
             for number in range(arguments.stores):
                 with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-                    every.append(named_by_effects(number, 0.8 * arguments.planted, Path(folder)))
+                    every.append(named_by_effects(number, 4.0 * arguments.planted, Path(folder)))
             print(f"  {kind:8} names something in {sum(map(bool, every)) / len(every):.1%}", flush=True)
             for asks in EFFECT_SENTENCES:
                 print(f"           {asks:40} {sum(asks in named for named in every) / len(every):.1%}", flush=True)
