@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -42,6 +43,8 @@ from vla_attention.schemas.errors import BadArgument, listing, plural
 _MISSING = "What if a word is left out?"
 #: Of the items, so many are drawn over time.
 _MOST_DRAWN = 4
+#: The logarithm of the largest effect, over another noise seed's, of which it is worth saying that it would be shown.
+_MOST_TIMES = math.log(100)
 _SIDES = ("pictures", "text")
 _OF_SIDE = pl.col("item_kind").is_in(_SIDES)
 
@@ -167,12 +170,16 @@ def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> 
 
 
 def _would_be_shown(words: pl.DataFrame, units: ActionUnits) -> list[str]:
-    """Without how large an effect of a word nothing would have been shown, of the median word."""
-    sizes = words.select(pl.col("noise") * pl.col("detectable").exp()).to_series().drop_nulls().to_list()
-    if not sizes:
+    """How large the effect of a word must be so that 80 % of runs of this size show it, of the median word."""
+    times, noise = (words[name].drop_nulls() for name in ("detectable", "noise"))
+    middle, beside = (one.median() if len(one) else None for one in (times, noise))
+    if not isinstance(middle, float) or not isinstance(beside, float):
         return []
-    size = units.said(f"{sorted(sizes)[len(sizes) // 2]:.2g}")
-    return [f"A word without which {size} is shown in 80% of runs of this size."]
+    if middle > _MOST_TIMES:
+        return ["A run of this size shows the effect of hardly any word: record more episodes."]
+    return [
+        f"In 80% of runs of this size a word is shown without which {units.said(f'{beside * math.exp(middle):.2g}')}."
+    ]
 
 
 def _without(row: Mapping[str, Any]) -> str:
