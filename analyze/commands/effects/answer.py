@@ -177,9 +177,8 @@ def _would_be_shown(words: pl.DataFrame, units: ActionUnits) -> list[str]:
         return []
     if middle > _MOST_TIMES:
         return ["A run of this size shows the effect of hardly any word: record more episodes."]
-    return [
-        f"In 80% of runs of this size a word is shown without which {units.said(f'{beside * math.exp(middle):.2g}')}."
-    ]
+    size = units.said(f"{beside * math.exp(middle):.2g}")
+    return [f"In 80% of runs of this size a word is shown without which {size}."]
 
 
 def _without(row: Mapping[str, Any]) -> str:
