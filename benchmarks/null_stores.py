@@ -262,8 +262,8 @@ def named_by_effects(number: int, planted: float, folder: Path, tasks: int = 6, 
     """The findings of `effects` that name something in a store whose actions change as much without each word, part and
     picture, and with each word exchanged, as with another noise seed.
 
-    Tasks and episodes scatter, each item scatters by tasks, and replans scatter. In a planted store the word "the" of all
-    tasks changes the action by `planted` times as much more.
+    Tasks and episodes scatter, each item scatters by tasks, and replans scatter. In a planted store the word "the", in
+    all tasks, changes the action by `planted` times as much more.
     """
     generator = np.random.default_rng(number)
     scene, of_item = generator.normal(0, 0.2, (tasks, episodes)), dict[str, Rows]()
