@@ -9,7 +9,7 @@ names, in the policy's own normalised actions, or, where nobody knows these, in 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,9 +18,10 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.estimate import Scale
+from vla_attention.analyze.core.hand_movements import TRANSLATION, Commands, commands_of, fitted
 from vla_attention.analyze.core.result import Column
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
+from vla_attention.schemas.episode_steps import EXECUTED, POSES
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -28,10 +29,9 @@ from vla_attention.schemas.stores.store_format import CALLERS_MODULES, CorruptEp
 
 Array = NDArray[np.float64]
 
-#: The dimensions of an action that move and turn the hand, along the axes of the world and around them, and that of the
-#: gripper: a command above 0 closes it, one below 0 opens it, 0 leaves it as it is. Every suite of the capture side
-#: drives robosuite's Panda arm and gripper.
-TRANSLATION, ROTATION, GRIPPER = slice(0, 3), slice(3, 6), -1
+#: Position of the gripper command in an action: above 0 it closes, below 0 it opens, 0 leaves it as it is. Every suite
+#: of the capture side drives robosuite's Panda gripper.
+GRIPPER = -1
 #: A dimension with less spread than this part of the largest one is not driven by the policy. Division by its spread
 #: would make what is left of it, rounding or noise of the denoising, as large as a real movement.
 LEAST_SPREAD = 0.01
@@ -41,6 +41,8 @@ _LEAST_EXPLAINED, _LEAST_TURNS = 0.8, 0.5
 #: Smaller changes are rounding, in any unit: in float32 calls made again without a change stay below it, in bfloat16
 #: they reach .02 to .05.
 ROUNDING = 1e-3
+#: The arrays that units are found from.
+_REFERENCES = ("actions", "dataset_actions", POSES, EXECUTED)
 #: The first part of all, by which items are ranked and tested: its column in every table.
 EFFECT = "effect"
 
@@ -137,19 +139,6 @@ def small_size(value: float) -> str:
     return f"{value:.2g}" if value >= ROUNDING else f"less than {ROUNDING:g}"
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How commands move the hand: moved = factor x command, least squares through 0.
-
-    factor: per unit of a command. error: its standard error, jackknife over episodes. explained: part of the squared
-    movements of left-out episodes that the others' factor explains, at most 1.
-    """
-
-    factor: float
-    error: float
-    explained: float
-
-
 def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: bool = False) -> ActionUnits:
     """What changes of the stores' actions are measured by: over all of their episodes, whichever are selected.
 
@@ -159,45 +148,50 @@ def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: b
         BadArgument: an episode holds no actions, they are the same everywhere, or the units do not fit them.
         CorruptEpisode: an episode is damaged.
     """
-    episodes = [*readable_episodes(stores, skip_corrupt)]
-    actions = [actions_of(*one) for one in episodes]
+    actions, commands, scales = [], [], []
+    for store, episode, arrays in readable_episodes(stores, skip_corrupt):
+        # Where it holds none, this says so.
+        actions.append(arrays["actions"] if "actions" in arrays else actions_of(store, episode))
+        commands += [one] if (one := commands_of(episode, arrays)) is not None else []
+        scales += [np.array(of.units)] if (of := episode.attributes.effects) is not None else []
     size = actions[0].shape[-1] if actions else 0
     if units:
         return ActionUnits(tuple(parse_units(units, size)))
     ours = not any(store.attributes.protocol.of_other_loop for store in stores)
-    if ours and (found := hand_and_gripper(_commands(episodes))) is not None:
+    if ours and (found := hand_and_gripper(commands)) is not None:
         return found
     policy, data_set = stores[0].attributes.policy, stores[0].attributes.data_set
-    if policy.checkpoint_format != CALLERS_MODULES:
-        scales = [np.array(of.units) for _, one in episodes if (of := one.attributes.effects) is not None]
-        if scales:
-            scale = 1 / np.where(scales[0] == 0, 1.0, scales[0])
-            names = () if data_set is None or len(data_set.action_names) != size else data_set.action_names
-            return ActionUnits(tuple(parts_of_names(names, scale))) if names else _normalised(scale, ours)
+    if policy.checkpoint_format != CALLERS_MODULES and scales:
+        scale = 1 / np.where(scales[0] == 0, 1.0, scales[0])
+        names = () if data_set is None or len(data_set.action_names) != size else data_set.action_names
+        return ActionUnits(tuple(parts_of_names(names, scale))) if names else _normalised(scale, ours)
     spread = action_spread(actions)
     if not spread.used.any():
         raise BadArgument(
             f"In {stores[0].path} the actions are the same in every replan and step, so a change has no unit; ask a "
             "store of a robot that moves."
         )
-    return _of_spread(spread)
+    return in_spread(spread)
 
 
-def readable_episodes(stores: Sequence[Store], skip_corrupt: bool) -> Iterator[tuple[Store, StoredEpisode]]:
-    """All episodes of stores with policy calls, whichever are selected; without the damaged ones if asked."""
+def readable_episodes(
+    stores: Sequence[Store], skip_corrupt: bool
+) -> Iterator[tuple[Store, StoredEpisode, Mapping[str, Array]]]:
+    """All episodes of stores with policy calls, whichever are selected, and their arrays of `_REFERENCES`.
+
+    skip_corrupt: without those of which one is damaged.
+    """
     for store in stores:
         for episode in store.episodes:
             try:
                 if not episode.attributes.num_replans:
                     continue
-                for name in ("actions", "dataset_actions"):
-                    if episode.has(name):
-                        episode.read(name)
+                arrays = {name: episode.read(name).astype(np.float64) for name in _REFERENCES if episode.has(name)}
             except CorruptEpisode:
                 if not skip_corrupt:
                     raise
                 continue
-            yield store, episode
+            yield store, episode, arrays
 
 
 def _normalised(scale: Array, ours: bool) -> ActionUnits:
@@ -223,7 +217,8 @@ def parts_of_names(names: Sequence[str], scale: Array) -> Iterator[Part]:
         yield Part(column, f"{name.replace('_', ' ')} (normalised)", said, dimensions, scale[dimensions])
 
 
-def _of_spread(spread: ActionSpread) -> ActionUnits:
+def in_spread(spread: ActionSpread) -> ActionUnits:
+    """In standard deviations of a run's actions, over the dimensions that are used."""
     said = "the action changes by {} standard deviations of the run's actions"
     used = np.flatnonzero(spread.used)
     left = [f"{i}" for i in spread.left_out]
@@ -235,37 +230,6 @@ def _of_spread(spread: ActionSpread) -> ActionUnits:
 def _gripper(size: int) -> Part:
     said = "the gripper is told the opposite in {} of the steps"
     return Part("gripper", "gripper", said, np.array([size - 1]), np.ones(1), "opposite")
-
-
-@dataclass(frozen=True)
-class Commands:
-    """Of an episode, by replan: the executed commands summed up, and how the hand moved. Each (replan, 3).
-
-    moved: metres. told: sum of the translations. turned: rotation vectors in radians, around the world's axes.
-    told_turn: sum of the rotations.
-    """
-
-    moved: Array
-    told: Array
-    turned: Array
-    told_turn: Array
-
-
-def _commands(episodes: Sequence[tuple[Store, StoredEpisode]]) -> list[Commands]:
-    found = []
-    for _, episode in episodes:
-        steps = episode.attributes.steps
-        if steps is None or not (episode.has(POSES) and episode.has(EXECUTED)):
-            continue
-        executed, env_step = episode.read(EXECUTED).astype(np.float64), np.array(episode.attributes.env_step)
-        starts = env_step - env_step[0]
-        if executed.shape[1] != 7 or starts[-1] >= len(executed):
-            continue
-        hand = episode.read(POSES).astype(np.float64)[np.append(starts, len(executed)), steps.bodies.index(HAND)]
-        sums = np.add.reduceat(executed, starts, axis=0)
-        turned = rotation_vectors(hand[:, 3:])
-        found.append(Commands(np.diff(hand[:, :3], axis=0), sums[:, TRANSLATION], turned, sums[:, ROTATION]))
-    return found
 
 
 def hand_and_gripper(commands: Sequence[Commands]) -> ActionUnits | None:
@@ -299,41 +263,6 @@ def hand_and_gripper(commands: Sequence[Commands]) -> ActionUnits | None:
         )
         note += f"; it turns it by {degrees:.1f} ± {np.degrees(turns.error):.1f} degrees ({turns.explained:.0%})"
     return ActionUnits((*parts, _gripper(7)), (f"{note}.",))
-
-
-def fitted(pairs: Sequence[tuple[Array, Array]]) -> Fit | None:
-    """Fit what moved to what was told, each (replan, axis) by episode; None where nothing was told or moved.
-
-    One episode is left out at a time; of a single episode one replan.
-    """
-    if len(pairs) == 1:
-        pairs = [(told[None], moved[None]) for told, moved in zip(*pairs[0], strict=True)]
-    sums = np.array([((told * moved).sum(), (told**2).sum(), (moved**2).sum()) for told, moved in pairs])
-    both, told, moved = sums.sum(axis=0)
-    others = sums.sum(axis=0) - sums
-    if len(pairs) < 2 or told <= 0 or moved <= 0 or (others[:, 1] <= 0).any():
-        return None
-    factors = others[:, 0] / others[:, 1]
-    left = (sums[:, 2] - 2 * factors * sums[:, 0] + factors**2 * sums[:, 1]).sum()
-    n = len(pairs)
-    error = np.sqrt((n - 1) / n * ((factors - factors.mean()) ** 2).sum())
-    return Fit(float(both / told), float(error), float(1 - left / moved))
-
-
-def rotation_vectors(quaternions: Array) -> Array:
-    """From each orientation (moment, 4: w, x, y, z) to the next, axis x angle in radians, in the world (moment - 1, 3).
-
-    Of unit quaternions, q_next x conjugate(q); the shorter way round.
-    """
-    w, v = quaternions[:, 0], quaternions[:, 1:]
-    scalar = w[1:] * w[:-1] + (v[1:] * v[:-1]).sum(axis=1)
-    vector = -w[1:, None] * v[:-1] + w[:-1, None] * v[1:] - np.cross(v[1:], v[:-1])
-    vector = np.where(scalar[:, None] < 0, -vector, vector)
-    length = np.linalg.norm(vector, axis=1)
-    angle = 2 * np.arctan2(length, np.abs(scalar))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        found: Array = np.where(length[:, None] > 0, vector / length[:, None], 0.0) * angle[:, None]
-    return found
 
 
 def parse_units(texts: Sequence[str], size: int) -> Iterator[Part]:

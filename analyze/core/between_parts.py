@@ -20,7 +20,6 @@ from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.levels import Levels, groups_by, ratios_by
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
-from vla_attention.analyze.statistics.intervals import Estimate
 from vla_attention.analyze.statistics.many_looks import SHOWN_AT, adjusted_p_values
 from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.units import Sampling
@@ -82,17 +81,13 @@ def _differences(both: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
         low, high = factor.interval() or (None, None)
         p_values.append(factor.p_value(0.0))
         tasks = part.select("suite", "task_id").n_unique()
-        ends = (one.mean_first, one.mean_second, factor.value, low, high, _detectable(factor, len(parts)))
+        ends = (one.mean_first, one.mean_second, factor.value, low, high, factor.detectable(0.0, SHOWN_AT / len(parts)))
         rows.append((part["item"][0], *map(_exp, ends), one.num_first, one.num_second, tasks))
     names = ("solved", "failed", "times", "times_low", "times_high", "detectable")
     schema = {"item": pl.String, **dict.fromkeys(names, pl.Float64)}
     schema |= dict.fromkeys(("num_solved", "num_failed", "num_tasks"), pl.Int64)
     q = pl.Series("q", adjusted_p_values(p_values), pl.Float64)
     return pl.DataFrame(rows, schema=schema, orient="row").with_columns(q)
-
-
-def _detectable(difference: Estimate, looks: int) -> float | None:
-    return difference.detectable(0.0, SHOWN_AT / looks)
 
 
 def _exp(value: float | None) -> float | None:

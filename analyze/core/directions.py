@@ -13,7 +13,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.action_changes import TRANSLATION, BaseEpisode, counted
+from vla_attention.analyze.core.action_changes import BaseEpisode, counted
+from vla_attention.analyze.core.hand_movements import TRANSLATION
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.effects import CHANGE

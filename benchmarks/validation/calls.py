@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.action_changes import ActionSpread, action_spread, counted
+from vla_attention.analyze.core.action_changes import ActionSpread, action_spread, in_spread
 from vla_attention.analyze.statistics.intervals import estimates, ratio_of_means_over_episodes
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
@@ -76,7 +76,7 @@ class ChangedEpisode:
     def effect(self, name: str, spread: ActionSpread, against: str | None = None) -> Array:
         """Effects (replan,) in spreads of the run; against: another change instead of the store."""
         base = self.base if against is None else self.actions[against]
-        return root_mean_square_change(base, self.actions[name], spread, self.executed)
+        return in_spread(spread).parts[0].of(base, self.actions[name], self.executed)
 
 
 def spread_of(store: Store) -> ActionSpread:
@@ -124,23 +124,6 @@ def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         return Noise(*np.where(spread > 0, np.sqrt(values.T) / spread, np.nan))
-
-
-def root_mean_square_change(base: Array, other: Array, spread: ActionSpread, steps: NDArray[np.int64]) -> Array:
-    """Root mean square over the first steps of each chunk, and over dimensions, of the change in units of the spread.
-
-    Args:
-        base, other: actions (replan, step, dimension).
-        spread: the units.
-        steps: (replan,) how many steps of each chunk count, at least 1.
-
-    Returns:
-        (replan,).
-    """
-    change = (other - base)[..., spread.used] / spread.spread[spread.used]
-    squares = (change**2).mean(axis=2)
-    result: Array = np.sqrt((squares * counted(steps, squares.shape[1])).sum(axis=1) / steps)
-    return result
 
 
 def chosen_replans(number: int, count: int) -> NDArray[np.int64]:

@@ -22,6 +22,7 @@ from vla_attention.analyze.commands.effects.items import (
     columns_of_items,
     exchanged,
     figures_of_items,
+    gripper_flips,
     named_sizes,
     with_exchanges,
     with_noise_row,
@@ -37,7 +38,6 @@ from vla_attention.analyze.core.recorded_effects import ITEM, RecordedEffects, r
 from vla_attention.analyze.core.result import Figure, Finding, Result, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, listing, plural
 
 _MISSING = "What if a word is left out?"
@@ -86,7 +86,7 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
         return [Finding(said, _MISSING, next_step=how_to_record_effects(question))], []
     episodes, units = found.episodes(), found.units
     summary = summary_of(episodes, units, question.sampling)
-    table = _with_exchanges(question, episodes, with_untested(question, by_item(summary, units))).filter(IS_WORD)
+    table = with_exchanges(question, episodes, with_untested(question, by_item(summary, units))).filter(IS_WORD)
     columns = [column for column in columns_of_items(table, units) if column.name != "lift"]
     otherwise, tables = other_sentences(question, episodes, units)
     findings = [*exchanged(question, episodes, units), *otherwise, deciding(table, units, summary)]
@@ -110,7 +110,7 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
             [Table("effects_items", items, [*looks, *columns_of_items(items, units)]), *of_prompts, *files],
             [],
         )
-    items = _with_exchanges(question, episodes, with_untested(question, items))
+    items = with_exchanges(question, episodes, with_untested(question, items))
     of_words = pl.col("item_kind").is_in(["word", "exchange"])
     words, others = items.filter(IS_WORD), items.filter(~of_words)
     findings = [*exchanged(question, episodes, units), *otherwise, deciding(words, units, summary)]
@@ -121,11 +121,6 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
     tables = [Table("effects_items", shown, columns, "Without it, the action changes by", rows=16), *files]
     figures = figures_of_items(items, course, summary, units)
     return findings, [*of_prompts, *tables, Table("effects_time", course)], figures
-
-
-def _with_exchanges(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> pl.DataFrame:
-    words = with_exchanges(question, episodes, items.filter(IS_WORD))
-    return pl.concat([words, items.filter(~IS_WORD)], how="diagonal")
 
 
 def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> Finding:
@@ -189,7 +184,7 @@ def _of_gripper(words: pl.DataFrame, summary: pl.DataFrame) -> str:
     """The words without which the gripper is shown to be told the opposite more often than with other noise."""
     if "gripper" not in words.columns:
         return ""
-    sure = words.filter(pl.col("gripper_q") <= NAMED_AT, pl.col("gripper_minus_noise") > 0).sort("gripper")
+    sure = words.filter(gripper_flips("gripper_q")).sort("gripper")
     if sure.is_empty():
         return ""
     noise = summary.filter(kind="noise")["gripper"].drop_nulls().to_list()

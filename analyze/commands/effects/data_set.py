@@ -206,9 +206,9 @@ def _data_actions(episode: StoredEpisode) -> tuple[Array, NDArray[np.int64]]:
 def _spread(question: Question) -> ActionSpread:
     """The units, from all episodes of the stores: they do not change with --task."""
     steps = []
-    for _, episode in readable_episodes(question.stores, question.settings.skip_corrupt):
-        if episode.has("dataset_actions"):
-            actions, counts = _data_actions(episode)
+    for _, episode, arrays in readable_episodes(question.stores, question.settings.skip_corrupt):
+        if (actions := arrays.get("dataset_actions")) is not None:
+            counts = np.array(episode.attributes.dataset_action_count)
             steps.append(actions[np.arange(actions.shape[1])[None] < counts[:, None]][None])
     spread = action_spread(steps)
     if not spread.used.any():

@@ -15,6 +15,7 @@ from vla_attention.analyze.core.result import Column, Figure, Finding
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.interventions import PromptKind
 
@@ -76,15 +77,19 @@ def against_noise(gripper: bool = False) -> pl.Expr:
     """
     # On the scale of the effects themselves, which differ by factors: a difference would be of the largest episodes.
     q, above = pl.col("times_noise_q"), pl.col("times_noise")
-    flips = (pl.col("gripper_minus_noise_q") <= NAMED_AT) & (pl.col("gripper_minus_noise") > 0)
     return (
         pl.when(above.is_null()).then(pl.lit(NO_NOISE))
         .when((q <= NAMED_AT) & (above > 0)).then(pl.lit(MORE))
-        .when(flips if gripper else pl.lit(False)).then(pl.lit(GRIPPER_MORE))
+        .when(gripper_flips("gripper_minus_noise_q") if gripper else pl.lit(False)).then(pl.lit(GRIPPER_MORE))
         .when(q.is_null()).then(pl.lit(FEW))
         .when(q <= NAMED_AT).then(pl.lit(LESS))
         .otherwise(pl.lit(OPEN))
     )  # fmt: skip
+
+
+def gripper_flips(q: str) -> pl.Expr:
+    """Whether the gripper is shown to be told the opposite more often than with another noise seed; q: the column."""
+    return (pl.col(q) <= NAMED_AT) & (pl.col("gripper_minus_noise") > 0)
 
 
 def _with_ends(name: str, to: str = "") -> list[pl.Expr]:
@@ -105,7 +110,7 @@ def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) ->
     rows = episodes.filter(pl.col("item_kind").is_in(["exchange", "exchanged"]), kind="prompt")
     if rows.is_empty():
         return []
-    row = _of_exchanges(rows.with_columns(what=pl.lit("any word")), ["what"], question).row(0, named=True)
+    row = beside_noise(rows.with_columns(what=pl.lit("any word")), ["what"], question.sampling).row(0, named=True)
     words = rows["label"].unique().sort().to_list()
     size = units.size(row["effect"], with_interval(row, "effect"))
     said = f"with a word exchanged for another ({listing(words, 2)}) {size}"
@@ -119,22 +124,29 @@ def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) ->
     return [Finding(said, "Does it tell words apart?", numbers, limit)]
 
 
-def with_exchanges(question: Question, episodes: pl.DataFrame, words: pl.DataFrame) -> pl.DataFrame:
-    """The rows of words with what exchanging each for another word does: exchanged, and exchanged_than_noise."""
-    rows = episodes.filter(item_kind="exchange", kind="prompt")
+def with_exchanges(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> pl.DataFrame:
+    """The items; those that are words with what exchanging each for another does: exchanged, exchanged_than_noise."""
+    words, rows = items.filter(IS_WORD), episodes.filter(item_kind="exchange", kind="prompt")
     if rows.is_empty():
-        return words.with_columns(exchanged=pl.lit(None, pl.Float64), exchanged_than_noise=pl.lit(None, pl.String))
-    found = _of_exchanges(rows, ["item"], question)
-    found = found.select("item", exchanged="effect", exchanged_than_noise="than_noise")
-    return words.join(found, on="item", how="left", maintain_order="left")
+        words = words.with_columns(exchanged=pl.lit(None, pl.Float64), exchanged_than_noise=pl.lit(None, pl.String))
+    else:
+        found = beside_noise(rows, ["item"], question.sampling)
+        found = found.select("item", exchanged="effect", exchanged_than_noise="than_noise")
+        words = words.join(found, on="item", how="left", maintain_order="left")
+    return pl.concat([words, items.filter(~IS_WORD)], how="diagonal")
 
 
-def _of_exchanges(rows: pl.DataFrame, by: Sequence[str], question: Question) -> pl.DataFrame:
-    """Means over the exchanges of each episode, estimated: effect, noise, times_noise with q, than_noise."""
-    of_episodes = rows.group_by(*EPISODE_ID, *by, maintain_order=True).agg(pl.mean("effect", "noise"))
-    of_episodes = of_episodes.with_columns(times_noise=times("effect", "noise"))
+def beside_noise(rows: pl.DataFrame, by: Sequence[str], sampling: Sampling, family: Sequence[str] = ()) -> pl.DataFrame:
+    """Means over the conditions of each episode and item of `by`, estimated beside another noise seed.
+
+    Returns:
+        by, effect, noise, times_noise with q, over_noise (effect / noise), than_noise, and counts; see `estimate`.
+    """
+    rows = rows.group_by(*dict.fromkeys((*EPISODE_ID, *by)), maintain_order=True).agg(pl.mean("effect", "noise"))
+    rows = rows.with_columns(times_noise=times("effect", "noise"))
     sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
-    found = estimate(of_episodes, by, sizes, question.sampling, {"times_noise": 0.0})
+    quotients = {"over_noise": ("effect", "noise")}
+    found = estimate(rows, by, sizes, sampling, {"times_noise": 0.0}, family, quotients)
     return found.with_columns(than_noise=against_noise())
 
 

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from vla_attention.analyze.commands.effects.items import MORE, against_noise
+from vla_attention.analyze.commands.effects.items import MORE, beside_noise
 from vla_attention.analyze.core.about import with_interval
 from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.directions import directions, things_of_sentences
-from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.recorded_effects import times
+from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
@@ -33,16 +32,8 @@ def other_sentences(
     rows = episodes.filter(kind="prompt").with_columns(sentence=pl.col("item_kind").replace("exchange", "exchanged"))
     if not {*rows["sentence"]} - {"exchanged"}:  # single words are items like others
         return [], []
-    names = dict.fromkeys([*EPISODE_ID, *cells, "sentence"])
-    rows = rows.group_by(*names, maintain_order=True).agg(pl.mean("effect", "noise"))
-    rows = rows.with_columns(times_noise=times("effect", "noise"))
-    sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
-    found = estimate(
-        rows, [*cells, "sentence"], sizes, question.sampling, {"times_noise": 0.0}, cells,
-        {"over_noise": ("effect", "noise")},
-    )  # fmt: skip
-    down = [*(False for _ in cells), True]
-    found = found.with_columns(than_noise=against_noise()).sort(*cells, "effect", descending=down)
+    found = beside_noise(rows, [*cells, "sentence"], question.sampling, cells)
+    found = found.sort(*cells, "effect", descending=[*(False for _ in cells), True])
     shown = [*looks, *_columns(units)]
     table = Table("effects_prompts", found, shown, "Told something else, the action changes by")
     if looks:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,19 +15,19 @@ from tests.kit.site_stores import write_site_store
 from tests.kit.stores import small_effects, write_store
 from vla_attention.analyze.core.action_changes import (
     EFFECT,
-    Commands,
     Part,
     action_spread,
     first_angle,
-    fitted,
     hand_and_gripper,
     parse_units,
     parts_of_names,
-    rotation_vectors,
     units_of,
 )
+from vla_attention.analyze.core.hand_movements import Commands, fitted, rotation_vectors
+from vla_attention.schemas.episode_steps import POSES
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 GENERATOR = np.random.default_rng(0)
 
@@ -128,6 +129,19 @@ def test_units_are_those_of_the_whole_store_whatever_is_selected():
     one = store.effects(tasks=2)["effects"]
     every = store.effects()["effects"].filter(task_id=2)
     assert one["effect"].to_list() == pytest.approx(every["effect"].to_list(), rel=1e-9)
+
+
+def test_an_episode_whose_steps_are_damaged_is_left_out_of_the_units_if_asked(tmp_path):
+    broken, whole = tmp_path / "broken.zarr", tmp_path / "whole.zarr"
+    for path in (broken, whole):
+        shutil.copytree(va.example("cubes"), path)
+    name = "episodes/task000_episode000"
+    (chunk,) = [file for file in (broken / name / POSES).rglob("*") if file.is_file() and file.name != "zarr.json"]
+    chunk.write_bytes(bytes(byte ^ 1 for byte in chunk.read_bytes()))
+    shutil.rmtree(whole / name)
+    with pytest.raises(CorruptEpisode, match="task000_episode000"):
+        units_of([open_store(broken)])
+    assert units_of([open_store(broken)], skip_corrupt=True).notes == units_of([open_store(whole)]).notes
 
 
 @pytest.mark.parametrize(
