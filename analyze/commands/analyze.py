@@ -148,7 +148,7 @@ def _of_fractions(question: Question, rows: Mapping[str, _Row]) -> Finding:
 def _of_ratio(
     question: Question, part: Question, rows: Mapping[str, _Row], cell: _Row, episodes: pl.DataFrame
 ) -> list[Finding]:
-    """How attention is divided between both sides, and token by token; then the ratio itself.
+    """How attention is divided between both sides, and per token; then the ratio itself.
 
     part: the episodes in which both sides get attention; of the others there is no ratio.
     """
@@ -185,17 +185,16 @@ def _token_by_token(question: Question, cell: _Row, above: str, below: str) -> s
     """Which side a single token gets more attention on; nothing is claimed that the interval does not show."""
     compares, lift = question.grouping.compares_modalities, [cell[f"ratio_lift{end}"] for end in ("", "_low", "_high")]
     one, other = ("an image patch", "a token of the text") if compares else (f"one of {above}", f"one of {below}")
-    verb = "looks"
     if lift[0] < 1:  # the side that gets more stands first
-        one, other, verb, lift = other, one, "reads", inverse(*lift)
+        one, other, lift = other, one, inverse(*lift)
     value, low, high = lift
     bounds = f" [{low:.2g}, {high:.2g}]" if low is not None and says_a_size(low, high) else ""
     gets = f"{one} gets {value:.2g} times the attention of {other}{bounds}"
     if low is None:
-        return f"Token by token, {gets}; without an interval nobody knows whether that is more."
+        return f"Per token, {gets}; without an interval nobody knows whether that is more."
     if low <= 1 <= high:
-        return f"Token by token, neither is shown to get more: {gets}."
-    return f"Token by token, {gets}." if question.untrained or not compares else f"Token by token it {verb}: {gets}."
+        return f"Per token, neither is shown to get more: {gets}."
+    return f"{gets[0].upper()}{gets[1:]}."
 
 
 def _notes(levels: Levels, cell: _Row) -> list[str]:

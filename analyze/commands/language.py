@@ -120,7 +120,7 @@ def _behaviour_tables(asked: pl.DataFrame) -> list[Table]:
 
 _MATRIX = [
     Column("told", "text"),
-    Column("did", "text", "did", "the told goal where it was reached, else the goal of the scene that held first"),
+    Column("did", "text", "did", "the told goal where it was reached, else the first goal that was reached"),
     Column("episodes", "count"),
     Column("share", "percent", "of those told"),
 ]

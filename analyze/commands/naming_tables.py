@@ -62,7 +62,7 @@ def of_objects(question: Question, named: Naming, row: dict[str, Any]) -> Findin
     )
     said = f"at the first policy call they get {times(row, 'over_area')} the attention that their area would give"
     said += f", {times(row, 'over_place')} what their places explain" if place else ""
-    why = "no sentence names a thing that another task shows and does not name"
+    why = "in these episodes no sentence names a thing that another task shows and does not name"
     why = why if place else "no task has two episodes, so what places explain is not known"
     why = f"{listing(named.always)}: always named in this suite" if named.always else why
     limit = f"Whether it looks for what is named is not known: {why}. {enough(question)}".strip()
@@ -82,7 +82,7 @@ def tables_of_naming(named: Naming, later: pl.DataFrame) -> tuple[list[Table], l
     """
     if named.form is None:
         return [], []
-    title = "Policy call by policy call: the hand goes to what is named, and attention follows the hand"
+    title = "Policy call by policy call: after the first one, attention may follow the hand alone"
     first = Table("naming", named.rows, _NAMING, "What is named, over the same when it is not named", _IS_ANSWER)
     return [first], [Table("naming_course", later, _COURSE, title)]
 
@@ -102,7 +102,7 @@ _NAMING = (
     Column("camera", "text"),
     Column("ratio", "factor", "named / not", "attention at the first policy call to an object when it is named, over "
            "when it is not"),
-    Column("ratio_q", "p", "q", "p of 1"),
+    Column("ratio_q", "p", "q", "p of no difference"),
     Column("num_episodes", "count", "episodes"),
 )  # fmt: skip
 _COURSE = (

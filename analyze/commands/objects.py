@@ -141,7 +141,7 @@ def _columns(known: bool, num_tasks: int) -> list[Column]:
         Column("over_place", "factor", "over its place",
                "at the first policy call, attention to the object over the attention to where it stands in the task's "
                "other episodes; 1: the place alone explains it, as for an object that hardly moves"),
-        Column("over_place_q", "p", "q", "p of 1, adjusted for the number of rows (Benjamini-Hochberg)"),
+        Column("over_place_q", "p", "q", "p of no difference, adjusted for the number of rows (Benjamini-Hochberg)"),
     )  # fmt: skip
     return [
         Column("item", "text", "object"),

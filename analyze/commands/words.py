@@ -118,7 +118,7 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Fi
     recorded = any(item.episode.attributes.effects is not None for item in question.selected)
     path = shlex.quote(str(question.stores[0].path))
     effects = f"vla-attention effects {path}" if recorded else how_to_record_effects(question)
-    limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
+    limit = "Attention to a word does not say that it moves the action."
     limit = f"{enough(question)} {limit}".lstrip()
     if by:
         return Finding(

@@ -2,7 +2,7 @@
 
 An action has dimensions of several kinds, and a change of it is measured in several parts. Where the run's own steps
 say how its commands move the hand (`hand_and_gripper`): centimetres between where the hand would end, degrees between
-how it would be turned, and steps in which the gripper is told the opposite. Else in groups of dimensions that the user
+how it would be turned, and steps in which the gripper's command flips. Else in groups of dimensions that the user
 names, in the policy's own normalised actions, or, where nobody knows these, in the spread of the run.
 """
 
@@ -35,7 +35,7 @@ GRIPPER = -1
 #: A dimension with less spread than this part of the largest one is not driven by the policy. Division by its spread
 #: would make what is left of it, rounding or noise of the denoising, as large as a real movement.
 LEAST_SPREAD = 0.01
-#: Centimetres and degrees are told where commands explain at least these parts of the movements of left-out episodes.
+#: Centimetres and degrees are told where commands explain at least these parts of the movements of held-out episodes.
 #: Arms turn little in most tasks, and what contacts and the controller add weighs more there.
 _LEAST_EXPLAINED, _LEAST_TURNS = 0.8, 0.5
 #: Smaller changes are rounding, in any unit: in float32 calls made again without a change stay below it, in bfloat16
@@ -57,6 +57,7 @@ class Part:
         said: how a sentence has it, with {} for the number: "the hand ends {} cm elsewhere".
         dimensions: those of the action that it is of, (dimension,) whole numbers.
         scale: (dimension,) what a command of 1 is in the unit.
+        unit: what stands behind the number, where it is short.
         how: "end" is the length of the summed change over the executed steps; "mean" the root mean square change over
             executed steps and dimensions; "opposite" the share of the executed steps with the other sign.
     """
@@ -67,6 +68,7 @@ class Part:
     dimensions: NDArray[np.intp]
     scale: Array
     how: Literal["end", "mean", "opposite"] = "mean"
+    unit: str = ""
 
     def of(self, base: Array, other: Array, steps: NDArray[np.int64]) -> Array:
         """The change (replan,) from actions (replan, step, dimension) to others, over the first `steps` (replan,)."""
@@ -101,6 +103,10 @@ class ActionUnits:
     def said(self, number: str) -> str:
         """The first part with a number, as in a sentence."""
         return self.parts[0].said.format(number)
+
+    def short(self, value: float) -> str:
+        """A value of the first part, with its unit where that is short: "0.79 cm"."""
+        return f"{value:.2g} {self.parts[0].unit}".rstrip()
 
     def size(self, value: float, text: str = "") -> str:
         """The first part with a value, which is rounding below `ROUNDING`; text: the value, with an interval for it."""
@@ -228,7 +234,7 @@ def in_spread(spread: ActionSpread) -> ActionUnits:
 
 
 def _gripper(size: int) -> Part:
-    said = "the gripper is told the opposite in {} of the steps"
+    said = "the gripper command flips in {} of the steps"
     return Part("gripper", "gripper", said, np.array([size - 1]), np.ones(1), "opposite")
 
 
@@ -243,10 +249,10 @@ def hand_and_gripper(commands: Sequence[Commands]) -> ActionUnits | None:
     if moves is None or moves.explained < _LEAST_EXPLAINED:
         return None
     said = "the hand ends {} cm elsewhere"
-    parts = [Part(EFFECT, "hand elsewhere (cm)", said, np.arange(3), np.full(3, 100 * moves.factor), "end")]
+    parts = [Part(EFFECT, "hand elsewhere (cm)", said, np.arange(3), np.full(3, 100 * moves.factor), "end", "cm")]
     note = (
         f"A command of 1 for a step moves the hand by {100 * moves.factor:.2f} ± {100 * moves.error:.2f} cm, which "
-        f"explains {moves.explained:.0%} of the movements of left-out episodes"
+        f"explains {moves.explained:.0%} of the movements of held-out episodes"
     )
     turns = fitted([(one.told_turn, one.turned) for one in commands])
     if turns is not None and turns.explained >= _LEAST_TURNS:

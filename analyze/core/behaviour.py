@@ -235,7 +235,7 @@ def with_choices(frame: pl.DataFrame) -> pl.DataFrame:
     the stratum's episodes of one initial state, as a picture that one task has alone says what to do, too.
 
     Returns:
-        further columns: stratum; first (of the stratum's told goals, the one that held first; null: none, or several
+        further columns: stratum; first (of the stratum's told goals, the one reached first; null: none, or several
         at once); left_out (why the episode shows nothing; null: it does); block.
     """
     of_kind = pl.col("told_goal").n_unique().over("suite", "scene", "family")

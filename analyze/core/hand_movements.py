@@ -37,7 +37,7 @@ class Fit:
     """How commands move the hand: moved = factor x command, least squares through 0.
 
     factor: per unit of a command. error: its standard error, jackknife over episodes. explained: part of the squared
-    movements of left-out episodes that the others' factor explains, at most 1.
+    movements of held-out episodes that the others' factor explains, at most 1.
     """
 
     factor: float

@@ -117,7 +117,8 @@ def _could_show(shown: pl.DataFrame, strata: str, least_p: float) -> str:
     share = share_shown(shown["told_goal"].to_list(), shown[strata].to_list(), SHOWN_AT)
     if share is None:
         return f"Too few episodes: even without a mistake p would be {least_p:.2g}."
-    return f"A policy that does what it is told in {share:.0%} of so many episodes is shown to listen in 80% of runs."
+    said = f"With {plural(shown.height, 'episode')}, a policy that is right in {share:.0%} is shown to listen"
+    return f"{said} in 80% of runs."
 
 
 def _to_what(parts: pl.DataFrame) -> tuple[str, str, pl.DataFrame]:

@@ -239,7 +239,7 @@ def _label(change: str, kind: str, name: str, instead: str) -> str:
                "object": name.replace("_", " ")}  # fmt: skip
     said = _PARTS.get(name, name) if kind == "part" else of_kind.get(kind, name)
     if change == "only":
-        return f"all but the {kind if kind in ('pictures', 'text') else said}"
+        return f"only the {kind if kind in ('pictures', 'text') else said}"
     return f"random keys, as many as {said}" if change == "random" else said
 
 

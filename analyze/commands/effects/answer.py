@@ -17,7 +17,7 @@ from vla_attention.analyze.commands.effects.items import (
     MORE,
     MOST_NAMED,
     NO_NOISE,
-    OPEN,
+    NOT_EXCHANGED,
     by_item,
     columns_of_items,
     exchanged,
@@ -124,26 +124,25 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
 
 
 def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> Finding:
-    """The words without which the action changes most, of the rows of `by_item` that are words, with exchanges.
+    """The words without which the action changes most, of the rows of `with_exchanges` that are words.
 
-    A word whose exchange for another one was tried and is not shown to do anything is none of them: a sentence with a
-    missing word is new to a policy, one with another word is not. summary: for what another noise seed does.
+    A word that is `NOT_EXCHANGED` is none of them. summary: for what another noise seed does.
     """
     tested = words.drop_nulls("effect").sort("effect", descending=True)
     limits = [f"{plural(n, 'word')} of the instructions not tested."] if (n := words.height - tested.height) else []
     if tested.is_empty():
         return Finding("Not tested: no effect of a single word was recorded.", _MISSING, {}, " ".join(limits))
-    small = (pl.col("exchanged_than_noise") == OPEN) & (pl.col("exchanged") <= pl.col("noise"))
-    idle = (pl.col("exchanged_than_noise") == LESS) | small
-    moving = tested.filter(pl.col("than_noise").is_in([MORE, GRIPPER_MORE]))
-    held, sure = moving.filter(idle), moving.filter(~idle.fill_null(False))
-    far, few = sure.filter(than_noise=MORE), tested.filter(than_noise=FEW)
-    top = (far if far.height else tested).row(0, named=True)
+    held, few, far = (tested.filter(than_noise=kind) for kind in (NOT_EXCHANGED, FEW, MORE))
+    sure = tested.filter(pl.col("than_noise").is_in([MORE, GRIPPER_MORE]))
+    counted = tested.filter(pl.col("than_noise") != NOT_EXCHANGED)
+    top = next(rows for rows in (far, counted, tested) if rows.height).row(0, named=True)
     size = units.said(with_interval(top, "effect"))
-    noise = "" if top["noise"] is None else f" (another noise seed: {top['noise']:.2g})"
+    noise = "" if top["noise"] is None else f" (another noise seed: {units.short(top['noise'])})"
     if far.height:
         said = f"{_without(top)} {size}{noise}."
         said += f" Also more than noise: {named_sizes(far[1:])}." if far.height > 1 else ""
+    elif counted.is_empty():
+        said = "No word is shown to move the action."
     elif few.height < tested.height:
         said = f"No word is shown to do more than another noise seed. Most without {top['label']}: {size}{noise}."
         limits += _would_be_shown(tested, units)
@@ -153,6 +152,8 @@ def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> 
     said += _of_gripper(sure, summary)
     if few.height:
         limits.insert(0, f"Too few episodes to say more of {listing(few['label'], MOST_NAMED)}.")
+    if sure.height and tested["exchanged"].count() and (alone := sure.filter(pl.col("exchanged").is_null())).height:
+        limits.insert(0, f"Only left out; no other word was tried in its place: {listing(alone['label'], MOST_NAMED)}.")
     if held.height:
         pairs = [
             f"{row['label']} ({row['effect']:.2g}; exchanged {small_size(row['exchanged'])})" for row in held.to_dicts()
@@ -181,7 +182,7 @@ def _without(row: Mapping[str, Any]) -> str:
 
 
 def _of_gripper(words: pl.DataFrame, summary: pl.DataFrame) -> str:
-    """The words without which the gripper is shown to be told the opposite more often than with other noise."""
+    """The words without which the gripper's command is shown to flip more often than with other noise."""
     if "gripper" not in words.columns:
         return ""
     sure = words.filter(gripper_flips("gripper_q")).sort("gripper")
@@ -190,7 +191,7 @@ def _of_gripper(words: pl.DataFrame, summary: pl.DataFrame) -> str:
     noise = summary.filter(kind="noise")["gripper"].drop_nulls().to_list()
     beside = f" (another noise seed: {noise[0]:.0%})" if noise else ""
     named = [f"{row['label']} in {row['gripper']:.0%}" for row in reversed(sure.to_dicts())]
-    return f" The gripper is told the opposite without {listing(named, MOST_NAMED)} of the steps{beside}."
+    return f" The gripper command flips without {listing(named, MOST_NAMED)} of the steps{beside}."
 
 
 def _sides(question: Question, episodes: pl.DataFrame, units: ActionUnits) -> list[Finding]:
@@ -227,8 +228,8 @@ def _others(items: pl.DataFrame) -> list[Finding]:
 
 
 def _without_and_with(rows: pl.DataFrame, value: str) -> str:
-    image = pl.col("kind") == "image"
-    sides = (("without", rows.filter(~image)), ("with", rows.filter(image)))
+    left = pl.col("kind").is_in(["image", "only"])
+    sides = (("without", rows.filter(~left)), ("with", rows.filter(left)))
     return "; ".join(f"{word} {named_sizes(part, value)}" for word, part in sides if part.height)
 
 

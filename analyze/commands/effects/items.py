@@ -23,6 +23,8 @@ from vla_attention.schemas.interventions import PromptKind
 MORE, GRIPPER_MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
     "more", "the gripper's is", "not shown to be more", "less", "too few episodes", "not tested", "not recorded"
 )  # fmt: skip
+#: A word without which it is more, and with another word in its place is not shown to be.
+NOT_EXCHANGED = "more, but not with another word"
 _SHOWN_KINDS = ("without", "only", "prompt", "image")
 #: In the order of tables and pictures.
 _KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "token", "exchange")
@@ -88,7 +90,7 @@ def against_noise(gripper: bool = False) -> pl.Expr:
 
 
 def gripper_flips(q: str) -> pl.Expr:
-    """Whether the gripper is shown to be told the opposite more often than with another noise seed; q: the column."""
+    """Whether the gripper's command is shown to flip more often than with another noise seed; q: the column."""
     return (pl.col(q) <= NAMED_AT) & (pl.col("gripper_minus_noise") > 0)
 
 
@@ -114,7 +116,7 @@ def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) ->
     words = rows["label"].unique().sort().to_list()
     size = units.size(row["effect"], with_interval(row, "effect"))
     said = f"with a word exchanged for another ({listing(words, 2)}) {size}"
-    said += "" if row["noise"] is None else f"; with another noise seed {row['noise']:.2g}"
+    said += "" if row["noise"] is None else f" (another noise seed: {units.short(row['noise'])})"
     verdict, limit = {
         MORE: ("It does: ", ""), LESS: ("It does not: ", "")
     }.get(row["than_noise"], ("", "Not shown to be more than noise."))  # fmt: skip
@@ -125,14 +127,24 @@ def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) ->
 
 
 def with_exchanges(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> pl.DataFrame:
-    """The items; those that are words with what exchanging each for another does: exchanged, exchanged_than_noise."""
+    """The items; those that are words with what another word in their place does: exchanged.
+
+    A word that moves the action where it is missing, and whose exchange is not shown to do anything, is
+    `NOT_EXCHANGED`: a sentence with a missing word is new to a policy, one with another word is not.
+    """
     words, rows = items.filter(IS_WORD), episodes.filter(item_kind="exchange", kind="prompt")
     if rows.is_empty():
-        words = words.with_columns(exchanged=pl.lit(None, pl.Float64), exchanged_than_noise=pl.lit(None, pl.String))
+        words = words.with_columns(exchanged=pl.lit(None, pl.Float64))
     else:
         found = beside_noise(rows, ["item"], question.sampling)
-        found = found.select("item", exchanged="effect", exchanged_than_noise="than_noise")
-        words = words.join(found, on="item", how="left", maintain_order="left")
+        small = (pl.col("than_noise") == OPEN) & (pl.col("effect") <= pl.col("noise"))
+        idle = (pl.col("than_noise") == LESS) | small
+        words = words.join(
+            found.select("item", exchanged="effect", idle=idle), on="item", how="left", maintain_order="left"
+        )
+        moves = pl.col("than_noise").is_in([MORE, GRIPPER_MORE])
+        held = pl.when(moves & pl.col("idle")).then(pl.lit(NOT_EXCHANGED)).otherwise("than_noise")
+        words = words.with_columns(than_noise=held).drop("idle")
     return pl.concat([words, items.filter(~IS_WORD)], how="diagonal")
 
 

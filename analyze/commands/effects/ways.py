@@ -44,7 +44,7 @@ def ways_of_words(question: Question, episodes: pl.DataFrame, words: pl.DataFram
             sizes = f"{min(left):.1%} to {max(left):.1%}" if several else f"{left[0]:.1%}"
             most = max(row["direct_part_high"] for row in some)
             said.append(
-                f"{listing([row['label'] for row in some], MOST_NAMED)} {'act' if several else 'acts'} through "
+                f"{listing([row['label'] for row in some], MOST_NAMED)} {'act' if several else 'acts'} mostly through "
                 f"{through}, which have read {'them' if several else 'it'}: hidden from the action tokens alone, "
                 f"{sizes} of the effect is left (95% intervals up to {most:.0%})"
             )

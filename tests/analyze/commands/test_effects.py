@@ -264,3 +264,22 @@ def test_the_units_are_those_of_the_whole_store_with_and_without_damaged_episode
     for settings in ({"tasks": (0,)}, {"tasks": (0,), "skip_corrupt": True}):
         one = effects(question_about(path, **settings))["deviation_replans"]
         assert_frame_equal(one, every.filter(task_id=0))
+
+
+def test_a_word_whose_exchange_does_nothing_is_named_nowhere(tmp_path):
+    """Of planted words that all move the action where they are missing, one does not where it is exchanged."""
+    plant = planted_effects(
+        lambda name, *where: scale(name, *where) * (1e-6 if name == f"exchange_word_{FIRST}" else 1.0), exchanged=True
+    )
+    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, plant_effects=plant))
+    result = effects(question_about(path, intervals="these-tasks"))
+    rows = result["effects_items"].filter(item_kind="word", kind="without")
+    sides = dict(rows.select("item", "than_noise").iter_rows())
+    assert sides.pop(FIRST) == "more, but not with another word"
+    alone = WORDS[-1]  # the last word is exchanged for none
+    assert {word for word, side in sides.items() if side == "more"} >= {alone}
+    assert result.findings[0].asks == "Does it tell words apart?"
+    for finding in result.findings[1:]:
+        assert f"'{FIRST}'" not in finding.sentence
+    deciding = next(one for one in result.findings if one.asks == "What if a word is left out?")
+    assert {f"'{FIRST}'", f"'{alone}'"} <= set(re.findall("'[^']*'", deciding.limit))
