@@ -184,7 +184,9 @@ def _of_ratio(
 def _token_by_token(question: Question, cell: _Row, above: str, below: str) -> str:
     """Which side a single token gets more attention on; nothing is claimed that the interval does not show."""
     compares, lift = question.grouping.compares_modalities, [cell[f"ratio_lift{end}"] for end in ("", "_low", "_high")]
-    one, other = ("an image patch", "a token of the text") if compares else (f"one of {above}", f"one of {below}")
+    one, other = "an image patch", "a token of the text"
+    if not compares:
+        one, other = f"a token of {above}", f"a token of {below}"
     if lift[0] < 1:  # the side that gets more stands first
         one, other, lift = other, one, inverse(*lift)
     value, low, high = lift

@@ -12,8 +12,9 @@ from vla_attention.analyze.commands.naming_tables import of_runs
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
-from vla_attention.analyze.core.compared import PAIR, Compared, RunValues, by_themselves, compared
+from vla_attention.analyze.core.compared import Compared, RunValues, by_themselves, compared
 from vla_attention.analyze.core.listening import IN_PART, listens, whatever
+from vla_attention.analyze.core.pairs import PAIR
 from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
@@ -58,6 +59,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
         findings += [*_needs(part), _attention(part)]
     findings += of_runs({one.run.name: one.named for one in (base, *rest)}, NAMED_AT / 6)
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
+    about += [line for part in parts for line in _how_alike(part)]
     about += dict.fromkeys(line for run in runs for line in run.question.told)
     about += [UNTRAINED] if any(run.question.untrained for run in runs) else []
     beside = dict.fromkeys(line for run in runs for line in notes(run.question) if line not in about)
@@ -86,6 +88,29 @@ def _outcome(run: Run, first: Run) -> str:
     outcomes = [item.episode.attributes.success for item in run.question.selected]
     policy = run.stores[0].attributes.policy.name
     return f"{policy} on {listing(run.suites)}, {solved(outcomes, run.question.num_tasks)}"
+
+
+def _how_alike(part: Compared) -> list[str]:
+    """What says that pairs begin alike, where it is not the initial state."""
+    runs, seen = f"{part.other.run.name} and {part.first.run.name}", part.pairs.filter(~pl.col("stated"))
+    by_number, apart = seen.filter(pl.col("pictures_apart").is_null()).height, part.refuted["pictures_apart"]
+    said = []
+    if len(apart):
+        said.append(
+            f"Not paired: {plural(len(apart), 'episode')} of {runs} with one task and number: their first pictures "
+            f"differ (on average by {min(apart):.0f} of 255 or more)."
+        )
+    if by_number:
+        said.append(
+            f"Paired by number only: nothing says that {plural(by_number, 'pair')} of episodes of {runs} with the same "
+            "task and number begin alike; give run.episode(initial_state=...) when you record."
+        )
+    if rest := seen.height - by_number:
+        said.append(
+            f"{plural(rest, 'pair')} of {runs} by task and number: their first pictures are alike, their initial "
+            "states are not known."
+        )
+    return said
 
 
 def _pairing(part: Compared, any_seed: bool) -> str:

@@ -108,7 +108,7 @@ def row_of(
         "own_goal": None if own is None else key_of(own),
         "family": attributes.task_family,
         "scene": "\n".join(sorted({key_of(goal) for goal in steps.goals})),
-        "state": attributes.initial_state,
+        "state": attributes.initial_state_digest or f"not known: {attributes.task_id}/{attributes.episode_index}",
         "outcome": attributes.success,
         "num_steps": attributes.num_steps,
         "touched": None if touched is None else visible(touched.replace("_", " ")),

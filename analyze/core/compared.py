@@ -1,8 +1,7 @@
 """The numbers of one run beside those of the first one: within pairs, or where none pairs of independent episodes.
 
-Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same
-noise, other weights. A rerun repeats the calls of its base, and pairs by episode. Differences within pairs do not
-contain differences between scenes. Every difference is the other run's value minus the first one's.
+Differences within pairs (`core.pairs`) do not contain differences between scenes. A rerun repeats the calls of its
+base, and pairs by episode. Every difference is the other run's value minus the first one's.
 
 A table of values has one row per (episode, item): `EPISODE_ID`, the columns of the item, `value`.
 """
@@ -10,7 +9,7 @@ A table of values has one row per (episode, item): `EPISODE_ID`, the columns of 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +22,7 @@ from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cel
 from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.naming import Naming, named_in
 from vla_attention.analyze.core.object_shares import object_values
+from vla_attention.analyze.core.pairs import MOST_APART, pairing, pairs_of, with_first_pictures
 from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
@@ -41,8 +41,6 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "objects": (("item",), ()),
     "effects": ((*ITEM, "reader"), ("reader",)),
 }
-#: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
-PAIR = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
 _TASK = ["suite", "task_id", "instruction"]
 
 
@@ -99,7 +97,8 @@ class Compared:
 
     Attributes:
         first, other: what was measured of both.
-        pairs: of their episodes, see `pairs_of`; without any, means of independent episodes are compared.
+        pairs: of their episodes, see `core.pairs`; without any, means of independent episodes are compared.
+        refuted: what would be pairs, but for the pictures that they begin with.
         rows: by kind, see `differences`.
         values: by kind, both values of every pair.
         units: of recorded effects; None where one of the runs has none.
@@ -111,6 +110,7 @@ class Compared:
     rows: Mapping[str, pl.DataFrame]
     values: Mapping[str, pl.DataFrame]
     units: ActionUnits | None = None
+    refuted: pl.DataFrame = field(default_factory=pl.DataFrame)
 
     @property
     def name(self) -> str:
@@ -137,7 +137,9 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
         RunsDiffer: a rerun has other replans than its base.
     """
     rerun = other.run.repeats(first.run)
-    pairs = pairs_of(first.episodes, other.episodes, rerun)
+    pairs = with_first_pictures(pairs_of(first.episodes, other.episodes, rerun), first.run, other.run)
+    otherwise = (pl.col("pictures_apart") > MOST_APART).fill_null(False)
+    pairs, refuted = pairs.filter(~otherwise), pairs.filter(otherwise)
     sides = [dict(first.values), dict(other.values)]
     if rerun:
         shared: Sequence[pl.DataFrame | None] = [None, None]
@@ -164,7 +166,7 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
             rows[kind] = differences(values[kind], item, sampling, looks)
         else:
             rows[kind] = differences_unpaired(of_kind, (first.episodes, other.episodes), item, sampling, looks)
-    return Compared(first, other, pairs, rows, values, units)
+    return Compared(first, other, pairs, rows, values, units, refuted)
 
 
 def _effects(first: Run, other: Run) -> tuple[list[pl.DataFrame], ActionUnits] | None:
@@ -247,36 +249,6 @@ def by_themselves(base: RunValues, rest: Sequence[RunValues], sampling: Sampling
         cells.append(tasks.with_columns(success_rate=pl.lit(None, pl.Float64)) if repeats else tasks)
         groups.append(task_groups(one.levels.episodes_groups(), sampling).select(name, pl.all()))
     return pl.concat(cells, how="diagonal"), pl.concat(groups, how="diagonal")
-
-
-def pairing(run: Run, ignore_seed: bool) -> pl.DataFrame:
-    """`EPISODE_ID`, instruction and `PAIR` of each selected episode; of other seeds too where they may differ."""
-    rows = [
-        (*item.key, about.instruction, about.initial_state, 0 if ignore_seed else item.store.attributes.protocol.seed)
-        for item in run.question.selected
-        for about in [item.episode.attributes]
-    ]
-    schema = {
-        "suite": pl.String, "task_id": pl.Int64, "episode_index": pl.Int64, "instruction": pl.String,
-        "initial_state_digest": pl.String, "seed": pl.Int64,
-    }  # fmt: skip
-    frame = pl.DataFrame(rows, schema=schema, orient="row")
-    return frame.with_columns(occurrence=pl.col("episode_index").rank("ordinal").over(PAIR[:-1]).cast(pl.Int64))
-
-
-def pairs_of(first: pl.DataFrame, other: pl.DataFrame, rerun: bool) -> pl.DataFrame:
-    """The pairs of two runs, from `pairing` of each.
-
-    Returns:
-        `PAIR`, instruction, episode_first, episode_other.
-    """
-    mine = first.rename({"episode_index": "episode_first"})
-    theirs = other.rename({"episode_index": "episode_other"}).drop("instruction")
-    keys = list(PAIR)
-    if rerun:
-        theirs = theirs.drop("occurrence").with_columns(episode_first="episode_other")
-        keys[-1] = "episode_first"
-    return mine.join(theirs, on=keys, how="inner").sort("suite", "task_id", "episode_first")
 
 
 def paired(pairs: pl.DataFrame, first: pl.DataFrame, other: pl.DataFrame, item: Sequence[str]) -> pl.DataFrame:

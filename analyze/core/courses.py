@@ -119,7 +119,7 @@ def leavings(
             if course is None:
                 continue
             state = item.episode.attributes.initial_state_digest
-            alike = [one for one in courses if one.item.episode.attributes.initial_state_digest == state]
+            alike = [one for one in courses if state and one.item.episode.attributes.initial_state_digest == state]
             near = _nearest(course, alike if same_state else courses if own else [])
             if near:
                 apart = _apart(course, near)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -9,7 +10,7 @@ from inspect import Parameter, signature
 from typing import Any, SupportsIndex
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
@@ -31,6 +32,7 @@ class EpisodeFacts:
     objects: tuple[SceneObject, ...] = ()
     task_family: str = ""
     siblings: Sequence[str] = ()
+    initial_state: str | ArrayLike = ""
 
     def __post_init__(self) -> None:
         """Check the numbers and the texts."""
@@ -46,6 +48,15 @@ class EpisodeFacts:
         check_text("task family", self.task_family)
         if isinstance(self.siblings, str) or not all(isinstance(text, str) for text in self.siblings):
             raise BadArgument(f"The siblings of an episode are {self.siblings!r}; expected a list of instructions.")
+        if not isinstance(self.initial_state, str) and np.asarray(self.initial_state).dtype.kind not in "biuf":
+            raise BadArgument(f"The initial state of an episode is {self.initial_state!r}; expected numbers or a text.")
+
+    @property
+    def initial_state_digest(self) -> str:
+        """The sha256 of the initial state, of its bytes as a simulator's is; empty where it is not known."""
+        state = self.initial_state
+        content = state.encode() if isinstance(state, str) else np.ascontiguousarray(state).tobytes()
+        return hashlib.sha256(content).hexdigest() if content else ""
 
 
 @dataclass(frozen=True)

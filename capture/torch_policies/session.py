@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import EpisodeStart
@@ -120,6 +121,7 @@ class RecordedRun:
         objects: Sequence[Any] = (),
         task_family: str = "",
         siblings: Sequence[str] = (),
+        initial_state: str | ArrayLike = "",
     ) -> Iterator[Episode]:
         """Record an episode; leaving the block stores it, an exception drops it.
 
@@ -133,6 +135,8 @@ class RecordedRun:
                 independent; empty: not known.
             siblings: instructions of the other tasks of its family: for effects, each word is exchanged for those that
                 stand in its place in them.
+            initial_state: what the episode begins with, a simulator's state (an array) or a name: episodes of two runs
+                are compared in pairs where it is equal. Its sha256 is stored; empty: not known.
 
         Raises:
             StoreExists: the episode is in the store already.
@@ -140,7 +144,7 @@ class RecordedRun:
             WeightsChanged: the policy has other weights than when the run began.
         """
         facts = EpisodeFacts(
-            task_id, episode_index, instruction, seed, task_name, tuple(objects), task_family, siblings
+            task_id, episode_index, instruction, seed, task_name, tuple(objects), task_family, siblings, initial_state
         )
         with ExitStack() as stack:
             episode = self._begin(stack, facts)
@@ -210,7 +214,7 @@ class RecordedRun:
             instruction=facts.instruction,
             episode_index=facts.episode_index,
             initial_state_index=facts.episode_index,
-            initial_state_digest="",
+            initial_state_digest=facts.initial_state_digest,
             objects=facts.objects,
             provenance=dict(self.attributes.provenance),
             task_family=facts.task_family,

@@ -389,11 +389,6 @@ class EpisodeAttributes(Document, frozen=True):
         for path in self.arrays:
             check_inner_path(path)
 
-    @property
-    def initial_state(self) -> str:
-        """What episodes of a task that begin alike share: the state's digest, or the number where it is not known."""
-        return self.initial_state_digest or f"episode {self.episode_index}"
-
 
 def episode_name(task_id: int, episode_index: int) -> str:
     """Name of an episode's group, for instance `task003_episode007`."""
