@@ -113,7 +113,9 @@ COMMANDS: dict[str, Command] = {
         page=True,
     ),
     "view": Command("a page on which to explore: episodes, words, patches, heads, groups", folder=True),
-    "store": Command("copy: pack, merge or slim stores; verify: check and repair them", folder=True, keeps=True),
+    "store": Command(
+        "copy: pack, merge or slim stores; verify: check and repair; outcomes: tell them later", folder=True, keeps=True
+    ),
 }
 #: The command of `vla-attention analyze STORE`.
 DEFAULT_COMMAND = "analyze"

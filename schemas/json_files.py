@@ -12,6 +12,7 @@ from typing import Any
 from vla_attention.schemas.groupings.grouping import GroupingFile
 from vla_attention.schemas.jsonable import json_schema
 from vla_attention.schemas.results import EpisodeResult
+from vla_attention.schemas.stores.outcomes import LaterOutcomes
 from vla_attention.schemas.stores.store_format import EpisodeAttributes, EpisodeSeal, RootAttributes
 
 FOLDER = Path(__file__).parent / "json"
@@ -30,6 +31,11 @@ def schema_documents() -> dict[str, dict[str, Any]]:
         ),
         "episode_seal.schema.json": json_schema(
             EpisodeSeal, "Episode seal", "Attributes of the group seal of an episode in a NAME.zarr store."
+        ),
+        "outcomes.schema.json": json_schema(
+            LaterOutcomes,
+            "Outcomes told later",
+            "outcomes.json of a NAME.zarr store.",
         ),
         "grouping.schema.json": json_schema(
             GroupingFile, "Grouping file", "A TOML grouping file, after reading: group name to selector or selectors."

@@ -253,7 +253,7 @@ def by_themselves(base: RunValues, rest: Sequence[RunValues], sampling: Sampling
 
 def paired(pairs: pl.DataFrame, first: pl.DataFrame, other: pl.DataFrame, item: Sequence[str]) -> pl.DataFrame:
     """The values of both episodes of every pair, and their difference: the pair, the item, first, other, difference."""
-    joined = pairs
+    joined = pairs.drop("stated", "pictures_apart")
     for side, values in (("first", first), ("other", other)):
         keys = ["suite", "task_id", f"episode_{side}", *(item if side == "other" else ())]
         of_side = values.rename({"episode_index": f"episode_{side}", "value": side}).select(*keys[:3], *item, side)

@@ -17,11 +17,11 @@ from vla_attention.analyze.core.runs import Run
 from vla_attention.analyze.measures.selected import SelectedEpisode
 
 #: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
-PAIR = ("suite", "task_id", "state", "seed", "occurrence")
+PAIR = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
 #: Pictures of one state differ by less, as a mean over a camera's numbers of 0 to 255: drivers draw a little otherwise.
 MOST_APART = 2.0
 _SCHEMA = {"suite": pl.String, "task_id": pl.Int64, "episode_index": pl.Int64, "instruction": pl.String,
-           "state": pl.String, "stated": pl.Boolean, "seed": pl.Int64}  # fmt: skip
+           "initial_state_digest": pl.String, "stated": pl.Boolean, "seed": pl.Int64}  # fmt: skip
 
 
 def pairing(run: Run, ignore_seed: bool) -> pl.DataFrame:
@@ -49,7 +49,7 @@ def pairs_of(first: pl.DataFrame, other: pl.DataFrame, rerun: bool) -> pl.DataFr
     """
     mine = first.rename({"episode_index": "episode_first"})
     theirs = other.rename({"episode_index": "episode_other", "seed": "seed_other"}).drop("instruction")
-    keys = ["suite", "task_id", "state", "stated", "occurrence"]
+    keys = ["suite", "task_id", "initial_state_digest", "stated", "occurrence"]
     if rerun:
         theirs = theirs.drop("occurrence").with_columns(episode_first="episode_other")
         keys[-1] = "episode_first"

@@ -1,4 +1,4 @@
-"""`vla-attention store copy` and `verify`: keeping stores."""
+"""`vla-attention store copy`, `verify` and `outcomes`: keeping stores."""
 
 from __future__ import annotations
 
@@ -42,12 +42,24 @@ of both, and --copy makes files of its own. What comes from elsewhere is always 
 """
 
 
+_OUTCOMES = """Tell the outcomes of episodes after they were recorded, from a scorer or a person. They lie beside the
+sealed episodes in outcomes.json; every question uses them, and copies keep them."""
+_OUTCOMES_EXAMPLES = """examples:
+  vla-attention store outcomes run.zarr scores.csv
+  vla-attention store outcomes run.zarr --remove
+
+A row of FILE.csv for each episode whose outcome the recording left open:
+  task_id,episode_index,success
+  0,0,1
+  0,1,0"""
+
+
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-attention store copy STORE ...` and `vla-attention store verify STORE ...`."""
+    """The parser of `vla-attention store`: copy, verify, outcomes."""
     parser = OneSentenceParser(
         prog="vla-attention store", description="Keep stores: copies, one store of several, checks."
     )
-    acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
+    acts = parser.add_subparsers(required=True, metavar="copy|verify|outcomes", parser_class=OneSentenceParser)
     what = "a copy: smaller, in tar files, from elsewhere; or one store of several"
     copy = acts.add_parser("copy", help=what, description=_DESCRIPTION, epilog=_EXAMPLES)
     given = "NAME.zarr or addresses; several become one store"
@@ -64,9 +76,16 @@ def build_parser() -> argparse.ArgumentParser:
     examples = EXAMPLES.replace("NAME", "vla-attention store")
     verify = acts.add_parser("verify", help=what, description=DESCRIPTION, epilog=examples)
     add_verify_arguments(verify)
-    for act, answer in ((copy, _run_copy), (verify, _run_verify)):
+    what = "tell outcomes of episodes that the recording did not know"
+    outcomes = acts.add_parser("outcomes", help=what, description=_OUTCOMES, epilog=_OUTCOMES_EXAMPLES)
+    outcomes.add_argument("store", type=Path, metavar="STORE")
+    what = "CSV with the columns task_id, episode_index and success (1 or 0, true or false)"
+    outcomes.add_argument("file", nargs="?", type=Path, metavar="FILE.csv", help=what)
+    outcomes.add_argument("--remove", action="store_true", help="take back what was told so far")
+    for act, answer in ((copy, _run_copy), (verify, _run_verify), (outcomes, _run_outcomes)):
         act.set_defaults(act=answer)
-        add_workers(act)
+        if act is not outcomes:
+            add_workers(act)
         add_threads(act, "threads that read episodes, at most 4 (default: OMP_NUM_THREADS, else the process's cores)")
     return parser
 
@@ -112,6 +131,24 @@ def _run_copy(arguments: argparse.Namespace) -> int:
     if arguments.copy:
         raise BadArgument("--copy is for several stores: the copy of one has files of its own anyway.")
     return _copy(stores[0], target, without, tar=arguments.tar)
+
+
+def _run_outcomes(arguments: argparse.Namespace) -> int:
+    """Tell outcomes, or take them back."""
+    from vla_attention.analyze.store.outcomes import remove_outcomes, tell_outcomes
+
+    path = arguments.store
+    if arguments.remove == (arguments.file is not None):
+        raise BadArgument("Give the CSV file of outcomes, or --remove to take back what was told.")
+    if arguments.remove:
+        remove_outcomes(path)
+        print(f"{path}: outcomes that were told after the recording are taken back.")
+        return 0
+    told = tell_outcomes(path, arguments.file)
+    known = f" ({told.known} were known to be so)" if told.known else ""
+    unread = f" Not read: the columns {', '.join(told.unread)}." if told.unread else ""
+    print(f"{path}: outcomes of {plural(told.added, 'episode')} are told{known}.{unread}")
+    return 0
 
 
 def _copy(place: StorePlace, target: Path, without: Sequence[str], *, tar: bool) -> int:

@@ -23,6 +23,7 @@ from vla_attention.schemas.errors import BadArgument, UserError, listing, unknow
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.durable_files import publish, publish_file
 from vla_attention.schemas.stores.locks import WHOLE_STORE, store_locks
+from vla_attention.schemas.stores.outcomes import read_outcomes, write_outcomes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import (
@@ -78,8 +79,8 @@ def open_source(place: StorePlace) -> Store:
     if not tars:
         return open_store(place)
     root, run = read_run(place)
-    names = sorted(tars, key=parse_episode_name)
-    return Store(place, root, run, tuple(StoredEpisode(tars[name], name, run) for name in names))
+    names, told = sorted(tars, key=parse_episode_name), read_outcomes(place)
+    return Store(place, root, run, tuple(StoredEpisode(tars[name], name, run, told.get(name)) for name in names))
 
 
 def _tars(store: Path) -> dict[str, Path]:
@@ -178,6 +179,7 @@ def _copy(
                 progress(1)
         if not tar:
             write_names(target, building)
+        write_outcomes(target, building, store.outcomes)
     return Copied(added, len(store.episodes) - added, copied, left)
 
 
@@ -223,21 +225,16 @@ def _refuse_others(store: Store, target: Path, present: Collection[str], buildin
         if episode.name not in present:
             continue
         try:
-            captured = _captured(_unpacked(copied[episode.name], building, SEAL_FILE))
+            captured = _unpacked(copied[episode.name], building, SEAL_FILE).captured
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Cannot continue the copy {target}: {error}") from None
-        if captured != _captured(_unpacked(episode, building, SEAL_FILE)):
+        if captured != _unpacked(episode, building, SEAL_FILE).captured:
             others.append(episode.name)
     if others:
         raise RunMismatch(
             f"Cannot continue the copy {target}: {listing(others, 4)} in it {'is' if len(others) == 1 else 'are'} not "
             f"what {store.path} has under the same name, which was recorded again since; give another name."
         )
-
-
-def _captured(episode: StoredEpisode) -> str:
-    """The digest of the seal under which an episode was captured."""
-    return episode.seal.copied_from or episode.seal.digest
 
 
 def copy_episode(
@@ -270,7 +267,7 @@ def copy_episode(
             place.write_bytes(_without_arrays(json.loads(place.read_bytes()), without))
     seal = folder / SEAL_FILE
     if without:
-        seal_episode(folder, episode.name, run, copied_from=_captured(episode))
+        seal_episode(folder, episode.name, run, copied_from=episode.captured)
     else:
         seal.parent.mkdir()
         seal.write_bytes(episode.source.whole(SEAL_FILE))

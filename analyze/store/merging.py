@@ -20,6 +20,7 @@ from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.locks import WHOLE_STORE, store_locks
+from vla_attention.schemas.stores.outcomes import write_outcomes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import group_attributes, group_document
@@ -72,6 +73,7 @@ def merge_stores(
             place = building / target.name
             merged = _merge(stores, place, progress, link)
             write_names(place, building)
+            write_outcomes(place, building, {name: one for store in stores for name, one in store.outcomes.items()})
             publish(place, target, durable=True)
             return merged
     except OSError as error:

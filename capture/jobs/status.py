@@ -66,7 +66,8 @@ class TaskStatus:
 @dataclass(frozen=True)
 class StoreStatus:
     """A store. `writing`: who is writing which of its episodes. `scenes`: how they differ from the published ones, of
-    `libero_physics`; empty where they do not."""
+    `libero_physics`; empty where they do not.
+    `told_later`: of how many episodes the outcome was told after the recording."""
 
     store: str
     suite: str
@@ -74,6 +75,7 @@ class StoreStatus:
     tasks: tuple[TaskStatus, ...]
     writing: tuple[Holder, ...]
     scenes: str
+    told_later: int = 0
 
     @property
     def complete(self) -> bool | None:
@@ -150,7 +152,9 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
             task.last_at, task.last_by = at, commit.by if commit else ""
     writing = tuple(episode_locks(path).holders())
     told = scenes.describe(path.name)
-    return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing, told)
+    return StoreStatus(
+        str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing, told, len(store.outcomes)
+    )
 
 
 def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool, verify: bool = False) -> int:
@@ -185,6 +189,8 @@ def _text(status: StoreStatus) -> str:
     rows += [task.cells() for task in tasks]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    if status.told_later:
+        lines.append(f"The outcomes of {plural(status.told_later, 'episode')} were told after the recording.")
     lines += status.lacking_lines()
     if any(task.damaged for task in tasks):
         lines.append(f"Damaged episodes are moved aside by: vla-attention capture verify {status.store} --repair")

@@ -9,6 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from vla_attention.schemas.jsonable import decode_json
 from vla_attention.schemas.stores.locks import WRITING_FOLDER
+from vla_attention.schemas.stores.outcomes import OUTCOMES_FILE
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.root import NAMES_FILE
 from vla_attention.schemas.stores.seal import SEAL_FILE
@@ -30,7 +31,7 @@ def foreign_in_store(store: Store) -> tuple[str, ...]:
     if isinstance(store.path, StoreUrl):
         return ()
     episodes = {f"{EPISODES_GROUP}/{episode.name}" for episode in store.episodes}
-    return _beyond(store.path, {"zarr.json", EPISODES_DOCUMENT, NAMES_FILE, WRITING_FOLDER, *episodes})
+    return _beyond(store.path, {"zarr.json", EPISODES_DOCUMENT, NAMES_FILE, OUTCOMES_FILE, WRITING_FOLDER, *episodes})
 
 
 def _beyond(place: Path, known: Set[str]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
@@ -22,6 +23,7 @@ from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.outcomes import LaterOutcome, read_outcomes
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import attributes_in, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
@@ -55,15 +57,17 @@ class StoredEpisode:
         folder: where it is.
         name: the name of its group, which its seal must have.
         run: digest of the configuration of the run that it must belong to, see `run_digest`.
+        outcome: what was told of it after the recording.
     """
 
     folder: StorePlace
     name: str
     run: str
+    outcome: LaterOutcome | None = None
 
     def __reduce__(self) -> tuple[object, ...]:
         """A pickle holds where the episode is and nothing that was read; another process may run in another folder."""
-        return StoredEpisode, (_from_anywhere(self.folder), self.name, self.run)
+        return StoredEpisode, (_from_anywhere(self.folder), self.name, self.run, self.outcome)
 
     @cached_property
     def source(self) -> ByteSource:
@@ -72,7 +76,7 @@ class StoredEpisode:
 
     @cached_property
     def attributes(self) -> EpisodeAttributes:
-        """The episode's attributes."""
+        """The episode's attributes; its success is what was told later, where the recording knew none."""
         document = self.document("zarr.json")
         try:
             given = attributes_in(document)
@@ -87,7 +91,15 @@ class StoredEpisode:
         stated = episode_name(attributes.task_id, attributes.episode_index)
         if stated != self.name:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are those of {stated}.")
-        return attributes
+        if self.outcome is None:
+            return attributes
+        if self.outcome.seal != self.captured:
+            told = f"The outcome that was told of {self.name} is of an earlier recording of it, and is not used."
+            warnings.warn(told, Note, stacklevel=2)
+            return attributes
+        if attributes.success not in (None, self.outcome.success):
+            raise CorruptEpisode(f"Episode {self.name} has an outcome, and another one was told of it later.")
+        return structs.replace(attributes, success=self.outcome.success)
 
     @cached_property
     def seal(self) -> EpisodeSeal:
@@ -105,6 +117,11 @@ class StoredEpisode:
         if problem is not None:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: {problem}.")
         return seal
+
+    @property
+    def captured(self) -> str:
+        """The digest of the seal under which the episode was captured, also of a copy that leaves something out."""
+        return self.seal.copied_from or self.seal.digest
 
     @cached_property
     def files(self) -> SealedFiles:
@@ -283,6 +300,11 @@ class Store:
         return self.attributes.protocol.suite
 
     @property
+    def outcomes(self) -> dict[str, LaterOutcome]:
+        """What was told of episodes after the recording, by their names."""
+        return {one.name: one.outcome for one in self.episodes if one.outcome is not None}
+
+    @property
     def task_ids(self) -> tuple[int, ...]:
         """Ids of the tasks that have at least one episode."""
         return tuple(sorted({parse_episode_name(episode.name)[0] for episode in self.episodes}))
@@ -313,7 +335,8 @@ def open_store(path: str | StorePlace) -> Store:
     if strays:
         warnings.warn(stray, Note, stacklevel=2)
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
-    episodes = tuple(StoredEpisode(folder, folder.name, run) for folder in folders)
+    told = read_outcomes(path)
+    episodes = tuple(StoredEpisode(folder, folder.name, run, told.get(folder.name)) for folder in folders)
     return Store(path, root, run, episodes, (stray,) if strays else ())
 
 

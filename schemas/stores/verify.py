@@ -14,6 +14,7 @@ from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.stores.digest import root_digest
 from vla_attention.schemas.stores.episode_checks import content_problems, form_problems
 from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
+from vla_attention.schemas.stores.outcomes import OUTCOMES_FILE, read_outcomes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import NAMES_FILE, group_attributes, names_document
@@ -93,6 +94,9 @@ def store_faults(store: Store) -> list[Fault]:
         names = [episode.name for episode in store.episodes]
         if (store.path / NAMES_FILE).read_bytes() != names_document(names):
             faults.append(Fault(NAMES_FILE, "it lists other episodes than are there; web servers give those it lists"))
+    strangers = sorted(read_outcomes(store.path).keys() - {episode.name for episode in store.episodes})
+    if strangers:
+        faults.append(Fault(OUTCOMES_FILE, f"it has outcomes of {listing(strangers, 4)}, which are not there"))
     return faults
 
 

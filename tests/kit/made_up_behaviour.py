@@ -59,7 +59,7 @@ def did(
             episode_index=number,
             instruction=sentence,
             task_family=family if isinstance(family, str) else family[task],
-            initial_state=str(number) if state is None else state,
+            initial_state_digest=str(number) if state is None else state,
             success=task in seen,
             scene_task_id=None,
             num_steps=last,

@@ -35,7 +35,7 @@ def test_it_follows_where_it_touches_what_the_told_sentence_alone_names(touched,
     )
     steps = EpisodeSteps(bodies, tuple(7 if body == touched else None for body in bodies), goals)
     attributes: Any = SimpleNamespace(
-        task_id=0, episode_index=0, instruction=TOLD, task_family="", initial_state="s", success=reached == 0,
+        task_id=0, episode_index=0, instruction=TOLD, task_family="", initial_state_digest="s", success=reached == 0,
         scene_task_id=1, num_steps=30,
         objects=tuple(SimpleNamespace(name=body, of_interest=body in ("bowl", "plate")) for body in bodies[1:]),
     )  # fmt: skip
