@@ -203,7 +203,7 @@ class OpenStores:
         runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
         return Answer.of(compared(runs, settings_from_keywords(**settings), _names(allow_mismatch)))
 
-    def effects(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
+    def effects(self, by: str | Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
         """What the action depends on, as far as the run recorded it (`vla-attention capture --effects`).
 
         Tables "effects_items", "effects_summary", "effects_episodes", "effects" (every replan, condition and reader),
@@ -219,14 +219,14 @@ class OpenStores:
         Raises:
             BadArgument: the stores hold neither effects nor a data set's actions.
         """
-        return self._answer("effects", settings, by=tuple(by))
+        return self._answer("effects", settings, by=_names(by))
 
     def overlay(
         self,
         episode: int | None = None,
         replans: int | Sequence[int] | None = None,
         cameras: str | Sequence[str] | None = None,
-        outline: Sequence[str] = (),
+        outline: str | Sequence[str] = (),
         video: Literal["gif", "mp4"] | None = None,
         **settings: Unpack[SettingKeywords],
     ) -> Answer:
@@ -242,8 +242,9 @@ class OpenStores:
             "episode": episode,
             "replans": [replans] if isinstance(replans, int) else replans,
             "cameras": [cameras] if isinstance(cameras, str) else cameras,
+            "outline": [outline] if isinstance(outline, str) else outline,
         }
-        return self._answer("overlay", settings, **own, outline=tuple(outline), video=video)
+        return self._answer("overlay", settings, **own, video=video)
 
     def report(
         self, path: str | Path, num_episodes: int = 2, num_replans: int = 8, **settings: Unpack[SettingKeywords]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.options import Numbers, add_options, number_range, read_options, task_option
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
@@ -168,11 +170,12 @@ def settings_of(given: argparse.Namespace) -> AnalysisSettings:
 def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.Namespace) -> Path:
     """`results/PATH OF STORE/COMMAND`, with the options that change the answer in its name.
 
-    A store outside of the working folder is named by its whole path: results of stores of one name lie apart. Further
-    runs of a comparison are named as it is.
+    No two stores have one folder, and none is outside of `results`. Further runs of a comparison are named as well, by
+    their file where they lie beside the first.
     """
     path, *others = (_path_of(store) for store in stores)
-    command = "-".join([command, *(one.with_suffix("").name for one in others)])
+    beside = [one.name if one.parent == path.parent else _with_digest(one.name, str(one)) for one in others]
+    command = "-".join([command, *beside])
     said = []
     for name in ("tasks", *OPTIONS):
         value = getattr(given, name, None)
@@ -183,12 +186,28 @@ def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.N
         said.append("-".join([name, *map(str, values)]))
     name = file_part("_".join([command, *said]))
     if len(name) > _LONGEST_NAME:
-        name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    return Path("results", *path.with_suffix("").parts, name)
+        name = _with_digest(name[:_LONGEST_NAME], name)
+    return Path("results", path, name)
 
 
 def _path_of(store: StorePlace) -> Path:
-    if not isinstance(store, Path):
-        return Path(*str(store).split("://", 1)[1].split("/"))
-    path = store.absolute()
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path.relative_to(path.anchor)
+    """The path below `results` of a store: that of NAME.zarr below the working folder as it is, without the ending.
+
+    Any other (outside of that folder, with another ending, at an address) ends with a digest of all of it, so that it
+    cannot be that of a store below.
+    """
+    if isinstance(store, Path):
+        # `..` would lead out of `results`, and behind a link it is not the folder above.
+        place = Path(os.path.realpath(store)) if ".." in store.parts else store.absolute()
+        if place.suffix == STORE_SUFFIX and Path.cwd() in place.parents:
+            return place.relative_to(Path.cwd()).with_suffix("")
+        parts, whole = place.relative_to(place.anchor).parts, str(place)
+    else:
+        whole = str(store)
+        parts = tuple(part for part in whole.split("://", 1)[1].split("/") if part not in ("", ".", ".."))
+    *above, name = (file_part(part) for part in parts or ("root",))
+    return Path(*above, _with_digest(name.removesuffix(STORE_SUFFIX), whole))
+
+
+def _with_digest(name: str, whole: str) -> str:
+    return f"{name}-{hashlib.sha256(whole.encode()).hexdigest()[:8]}"

@@ -67,7 +67,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
     of_pairs += [
         f"Only one of {first.name} and {run.name} holds the {listing(missing)}: not compared."
         for run in others
-        if run.repeats(first) and (missing := held_by_one(first.stores, run.stores))
+        if run.repeats(first) and (missing := held_by_one(first, run))
     ]
     cells, groups = by_themselves(base, rest, sampling)
     columns = [column for column in _RUNS if column.name in cells.columns]

@@ -65,7 +65,7 @@ def failures(question: Question, twins: Question | None = None) -> Result:
     return Result(
         "Why did it fail? What was done instead",
         about(question),
-        [*_why(question, failed, outcomes.height, lost), *where, *_foretold(outcomes)],
+        [*_why(question, failed, outcomes.height, lost), *where, *foretold(outcomes)],
         [*tables, _by_task(outcomes, bool(failed))],
         _strip(left),
         [*question.skipped, *(twins.told if twins else ())],
@@ -143,7 +143,7 @@ def _where(places: pl.DataFrame, num_failed: int, given: bool) -> list[Finding]:
     return [Finding(f"{begin}. {said}.", _WHERE, numbers, limit)]
 
 
-def _foretold(outcomes: pl.DataFrame) -> list[Finding]:
+def foretold(outcomes: pl.DataFrame) -> list[Finding]:
     """What the task alone says of the outcome, guessed from the task's other episodes, beside always one guess."""
     task, solved = ["suite", "task_id"], pl.col("solved").cast(pl.Int64)
     rest, of = solved.sum().over(task) - solved, pl.len().over(task) - 1
@@ -152,20 +152,21 @@ def _foretold(outcomes: pl.DataFrame) -> list[Finding]:
     if frame["solved"].n_unique() < 2:
         return []
     right, n, solved_ones = float(frame["right"].sum()), frame.height, int(frame["solved"].sum())
-    lost, longest = frame.filter(~pl.col("solved"))["num_steps"], max(frame["num_steps"].to_list())
     always = max(solved_ones, n - solved_ones)
-    said = (
-        f"Knowing the task alone predicts {right:g} of {n} outcomes (always guessing the more frequent one: {always}); "
-        f"{(lost == longest).sum()} of {len(lost)} failures lasted the most steps of all ({longest})."
-    )
-    return [Finding(said, _BEFORE, {"right": right, "n": n, "solved": solved_ones})]
+    said = f"Knowing the task alone predicts {right:g} of {n} outcomes (always the more frequent guess: {always})"
+    steps = frame["num_steps"].to_list()
+    if min(steps):  # 0 where a loop that is not ours did not say it
+        lost, won = (frame.filter(pl.col("solved") == solved)["num_steps"] == max(steps) for solved in (False, True))
+        said += f"; {lost.sum()} of {len(lost)} failures and {won.sum()} of {len(won)} solved episodes lasted the most "
+        said += f"steps of all ({max(steps)})"
+    return [Finding(f"{said}.", _BEFORE, {"right": right, "n": n, "solved": solved_ones})]
 
 
 def _by_task(outcomes: pl.DataFrame, shown: bool) -> Table:
     tasks = outcomes.group_by("suite", "task_id", "instruction").agg(
         pl.len().alias("episodes"),
         failed=(~pl.col("solved")).sum(),
-        steps=pl.col("num_steps").filter("solved").median(),
+        steps=pl.col("num_steps").filter("solved", pl.col("num_steps") > 0).median(),
     )
     columns = [
         Column("task_id", "count", "task"),

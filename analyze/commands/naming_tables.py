@@ -55,6 +55,8 @@ def of_runs(runs: Mapping[str, Sequence[Naming]], named_at: float) -> list[Findi
 
 def of_objects(question: Question, named: Naming, row: dict[str, Any]) -> Finding:
     """What objects get, named or not; and why it is not known whether what is named gets more."""
+    if not row:
+        return Finding("The pictures of the first policy calls show robot and background alone.", ASKS, {"shown": 0})
     place = row["over_place"] is not None
     low = row["over_place_low" if place else "over_area_low"]
     verdict = (

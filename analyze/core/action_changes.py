@@ -21,11 +21,12 @@ from vla_attention.analyze.core.estimate import Scale
 from vla_attention.analyze.core.hand_movements import TRANSLATION, Commands, commands_of, fitted
 from vla_attention.analyze.core.result import Column
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.stores.selection import read_usable
 from vla_attention.schemas.episode_steps import EXECUTED, POSES
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import CALLERS_MODULES, CorruptEpisode
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 Array = NDArray[np.float64]
 
@@ -183,21 +184,12 @@ def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: b
 def readable_episodes(
     stores: Sequence[Store], skip_corrupt: bool
 ) -> Iterator[tuple[Store, StoredEpisode, Mapping[str, Array]]]:
-    """All episodes of stores with policy calls, whichever are selected, and their arrays of `_REFERENCES`.
+    """`read_usable` of the arrays of `_REFERENCES`."""
 
-    skip_corrupt: without those of which one is damaged.
-    """
-    for store in stores:
-        for episode in store.episodes:
-            try:
-                if not episode.attributes.num_replans:
-                    continue
-                arrays = {name: episode.read(name).astype(np.float64) for name in _REFERENCES if episode.has(name)}
-            except CorruptEpisode:
-                if not skip_corrupt:
-                    raise
-                continue
-            yield store, episode, arrays
+    def references(episode: StoredEpisode) -> Mapping[str, Array]:
+        return {name: episode.read(name).astype(np.float64) for name in _REFERENCES if episode.has(name)}
+
+    return read_usable(stores, skip_corrupt, references)
 
 
 def _normalised(scale: Array, ours: bool) -> ActionUnits:

@@ -7,7 +7,6 @@ task whose instruction the sentence is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 
 import numpy as np
 import polars as pl
@@ -17,11 +16,12 @@ from vla_attention.analyze.core.action_changes import BaseEpisode, counted
 from vla_attention.analyze.core.hand_movements import TRANSLATION
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.stores.selection import read_usable
 from vla_attention.schemas.effects import CHANGE
 from vla_attention.schemas.episode_steps import HAND, POSES
 from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.stores.reader import Store
-from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, parse_episode_name
+from vla_attention.schemas.stores.store_format import EpisodeAttributes
 
 Array = NDArray[np.float64]
 Names = Mapping[tuple[str, ...], frozenset[str]]
@@ -30,18 +30,17 @@ Names = Mapping[tuple[str, ...], frozenset[str]]
 KINDS = ("exchanged", "other task", "contradicted")
 
 
-def things_of_sentences(stores: Sequence[Store]) -> Names:
-    """The things that the simulator says a task names, by the words of its instruction; of tasks' first episodes."""
+def things_of_sentences(stores: Sequence[Store], skip_corrupt: bool = False) -> Names:
+    """The things that the simulator says a task names, by the words of its instruction.
+
+    skip_corrupt: damaged episodes say nothing.
+    """
     found: dict[tuple[str, ...], frozenset[str]] = {}
-    for store in stores:
-        first = {parse_episode_name(episode.name)[0]: episode for episode in reversed(store.episodes)}
-        for episode in first.values():
-            with suppress(CorruptEpisode):  # `--skip-corrupt`
-                attributes = episode.attributes
-                found.setdefault(folded_words(attributes.instruction), _of_interest(attributes))
-                for goal in attributes.steps.goals if attributes.steps is not None else ():
-                    if goal.things:  # a task that shares the scene, whether the store has an episode of it or not
-                        found.setdefault(folded_words(goal.instruction), frozenset(goal.things))
+    for _, _, attributes in read_usable(stores, skip_corrupt, lambda episode: episode.attributes):
+        found.setdefault(folded_words(attributes.instruction), _of_interest(attributes))
+        for goal in attributes.steps.goals if attributes.steps is not None else ():
+            if goal.things:  # a task that shares the scene, whether the store has an episode of it or not
+                found.setdefault(folded_words(goal.instruction), frozenset(goal.things))
     return found
 
 

@@ -61,7 +61,7 @@ def exchanged(asked: pl.DataFrame, sampling: Sampling) -> tuple[list[Finding], l
         Table("exchange_kinds", kinds, _OF_KINDS, "Told another sentence: which of its words are in what it did"),
         Table("exchange_matrix", cells),
     ]
-    return [_finding(rates, kinds, rows.height - shown.height)], tables, [_matrix(cells)]
+    return [_finding(rates, kinds, rows.filter(~pl.col("counted"))["left_out"])], tables, [_matrix(cells)]
 
 
 def words_by_kind(sentence: str) -> dict[str, frozenset[str]]:
@@ -107,13 +107,14 @@ def _rates(rows: pl.DataFrame, by: str, shares: Sequence[str], sampling: Samplin
     return found.join(counts, on=by, how="left", maintain_order="left")
 
 
-def _finding(rates: pl.DataFrame, kinds: pl.DataFrame, left_out: int) -> Finding:
-    """How often another task's sentence was followed, beside the scene's own."""
+def _finding(rates: pl.DataFrame, kinds: pl.DataFrame, left_out: pl.Series) -> Finding:
+    """How often another task's sentence was followed, beside the scene's own. left_out: reasons for not counting."""
     known = {row["sentence"]: row for row in rates.iter_rows(named=True)}
     other, own = known.get(EXCHANGED), known.get(OWN)
-    limit = f"{plural(left_out, 'rollout')} not counted: the told goal held at the beginning." if left_out else ""
+    reasons = [f"{plural(number, 'rollout')} ({why})" for why, number in left_out.value_counts(sort=True).rows()]
+    limit = f"Not counted: {listing(reasons)}." if reasons else ""
     if other is None:
-        return Finding("No rollout of the exchange shows anything: every told goal held at the beginning.", _ASKS)
+        return Finding("No rollout with another task's sentence shows anything.", _ASKS, {}, limit)
     right, n = other["right"], other["num_episodes"]
     ends = (other["did_told_low"], other["did_told_high"])
     # All or none has no spread between tasks: the exact interval over these rollouts.

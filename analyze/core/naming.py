@@ -245,19 +245,21 @@ def differences(
 def at_objects(question: Question, measured: Sequence[Measured], found: Sequence[ObjectMaps]) -> dict[str, Any]:
     """What objects get at the first call, named or not: `estimate`'s row of over_area and over_place.
 
-    Of an episode each is the geometric mean over its objects, all cameras together.
+    Empty where pictures show none beside the robot and the background. Of an episode each is the geometric mean over
+    its objects, all cameras together.
     """
     keys = [*EPISODE_ID, "item"]
     things = [(*item.key, one.name) for item in question.selected for one in item.tokens.objects
               if one.kind in _COMPARED]  # fmt: skip
     rows = first_calls(measured).filter(camera=ALL_CAMERAS)
-    rows = rows.join(pl.DataFrame(things, schema=dict.fromkeys(keys), orient="row"), on=keys, how="semi")
+    rows = rows.join(pl.DataFrame(things, schema=rows.select(keys).schema, orient="row"), on=keys, how="semi")
     place = over_place(question, found).filter(camera=ALL_CAMERAS, kind="object", layer=LAYERS_AVG)
     rows = rows.join(place, on=keys, how="left")
     logs = {"over_area": pl.col("share") / pl.col("even_share"), "over_place": pl.col("at_place") / pl.col("elsewhere")}
     means = [(log := value.log()).filter(log.is_finite()).mean().exp().alias(name) for name, value in logs.items()]
     episodes = rows.group_by(EPISODE_ID, maintain_order=True).agg(means).with_columns(one=pl.lit(1))
-    return estimate(episodes, ["one"], dict.fromkeys(logs, "geometric"), question.sampling).to_dicts()[0]
+    seen = episodes.drop_nulls("over_area")
+    return next(estimate(seen, ["one"], dict.fromkeys(logs, "geometric"), question.sampling).iter_rows(named=True), {})
 
 
 def course(question: Question, measured: Sequence[Measured]) -> pl.DataFrame:

@@ -86,15 +86,15 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
         )
 
 
-def held_by_one(bases: Sequence[Store], reruns: Sequence[Store]) -> list[str]:
+def held_by_one(base: Run, rerun: Run) -> list[str]:
     """The inputs that only one of a run and its rerun holds, and which are therefore not compared."""
-    known = {(store.suite, episode.name): (store, episode) for store in bases for episode in store.episodes}
+    known = {(*item.task, item.episode.name): item for item in base.question.selected}
     found = []
-    for store in reruns:
-        for own in store.episodes:
-            base, episode = known.get((store.suite, own.name), (None, own))
-            for name in sorted({*_inputs(episode), *_inputs(own)} - _changed(base, store)) if base else ():
-                found += [_called(name, "s")] if episode.has(name) != own.has(name) else []
+    for own in rerun.question.selected:
+        if (item := known.get((*own.task, own.episode.name))) is not None:
+            both = item.episode, own.episode
+            for name in sorted({name for one in both for name in _inputs(one)} - _changed(item.store, own.store)):
+                found += [_called(name, "s")] if both[0].has(name) != both[1].has(name) else []
     return list(dict.fromkeys(found))
 
 
@@ -172,12 +172,10 @@ def moved_episodes(base: Run, reruns: Sequence[Run]) -> tuple[pl.DataFrame, Acti
     settings, pairs = base.question.settings, []
     units = units_of(base.stores, settings.units, settings.skip_corrupt)
     for run in reruns:
-        for store in run.stores:
-            for episode in store.episodes:
-                key = (store.suite, episode.attributes.task_id, episode.name)
-                if (member := members.get(key)) is not None:
-                    check_same_calls(member.item.store, member.item.episode, store, episode)
-                    pairs.append((run, member, actions_of(store, episode)))
+        for own in run.question.selected:
+            if (member := members.get((*own.task, own.episode.name))) is not None:
+                check_same_calls(member.item.store, member.item.episode, own.store, own.episode)
+                pairs.append((run, member, actions_of(own.store, own.episode)))
     for run in reruns:
         if not any(one is run for one, _, _ in pairs):
             raise BadArgument(f"The rerun {run.name} holds none of the selected episodes of {base.name}.")

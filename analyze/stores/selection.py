@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import LayerSelection, block_of_labels, select_layers
@@ -11,6 +12,8 @@ from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.options import resolve_tasks
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RootAttributes, StoreError, parse_episode_name
+
+Read = TypeVar("Read")
 
 
 @dataclass(frozen=True)
@@ -197,6 +200,29 @@ def check_combinable(stores: Sequence[Store]) -> None:
                     f"Stores {other.path} and {store.path} both hold {episode.name} of {store.suite}; analyse them one "
                     "at a time."
                 )
+
+
+def read_usable(
+    stores: Sequence[Store], skip_corrupt: bool, read: Callable[[StoredEpisode], Read]
+) -> Iterator[tuple[Store, StoredEpisode, Read]]:
+    """What is read of all episodes of stores with policy calls, whichever are selected: what all answers refer to.
+
+    skip_corrupt: without those of which it cannot be read.
+
+    Raises:
+        CorruptEpisode: an episode is damaged.
+    """
+    for store in stores:
+        for episode in store.episodes:
+            try:
+                if not episode.attributes.num_replans:
+                    continue
+                found = read(episode)
+            except CorruptEpisode:
+                if not skip_corrupt:
+                    raise
+                continue
+            yield store, episode, found
 
 
 def _check_root(store: Store) -> None:

@@ -30,7 +30,7 @@ from vla_attention.analyze.view.paths import RUNS, NothingThere
 from vla_attention.analyze.view.run_answers import KnownLines, runs_answer
 from vla_attention.analyze.view.served_stores import ServedStore
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 JSON, PNG, NPY = "application/json", "image/png", "application/octet-stream"
 #: Content and its type.
@@ -44,8 +44,8 @@ class Answers:
 
     def __init__(self) -> None:
         self._lock, self._drawing = threading.Lock(), threading.Lock()
-        self._open: OrderedDict[tuple[str, str, str], ShownEpisode] = OrderedDict()
-        self._units: dict[tuple[str, int], ActionUnits] = {}
+        self._open: OrderedDict[tuple[str, str], tuple[StoredEpisode, ShownEpisode]] = OrderedDict()
+        self._units: dict[str, tuple[Store, ActionUnits]] = {}
         self._lines: KnownLines = {}
 
     def answer(
@@ -71,7 +71,7 @@ class Answers:
             case ["about.json"]:
                 return _json(shown.about())
             case ["effects.json"]:
-                return _json(shown.effects(self._units_of(shown.store)))
+                return _json(shown.effects(self._units_of(served.store)))
             case ["actions", file]:
                 return npy(shown.changed_actions(_number(file, ".npy"))), NPY
             case ["film.gif"]:
@@ -96,25 +96,24 @@ class Answers:
             yield address, content
 
     def _shown(self, store: Store, name: str) -> ShownEpisode:
-        """An episode that stays open for its other answers, unless the store was captured anew."""
-        key = str(store.path), store.run, name
+        """An episode that stays open for its other answers, unless it was recorded again."""
+        key, episode = (str(store.path), name), next((one for one in store.episodes if one.name == name), None)
+        if episode is None:
+            raise NothingThere
         with self._lock:
-            if key not in self._open:
-                episode = next((episode for episode in store.episodes if episode.name == name), None)
-                if episode is None:
-                    raise NothingThere
-                self._open[key] = ShownEpisode(store, episode)
+            if key not in self._open or self._open[key][0] is not episode:
+                self._open[key] = episode, ShownEpisode(store, episode)
                 while len(self._open) > _OPEN:
                     self._open.popitem(last=False)
             self._open.move_to_end(key)
-            return self._open[key]
+            return self._open[key][1]
 
     def _units_of(self, store: Store) -> ActionUnits:
         """The units of effects, of the whole store as it is now."""
-        key = str(store.path), len(store.episodes)
-        if key not in self._units:
-            self._units[key] = units_of([store], skip_corrupt=True)
-        return self._units[key]
+        key = str(store.path)
+        if key not in self._units or self._units[key][0] is not store:
+            self._units[key] = store, units_of([store], skip_corrupt=True)
+        return self._units[key][1]
 
 
 def _addresses(shown: ShownEpisode, heads: bool) -> Iterator[str]:

@@ -97,7 +97,7 @@ def write_recordings(path: Path, store: Store, episodes: Sequence[StoredEpisode]
     if path.suffix == STORE_SUFFIX:
         raise BadArgument(f"Cannot write recordings to {path}: it is named like a store; give NAME.rrd or a folder.")
     rr = rerun_library()
-    units = units_of([store]) if any(one.attributes.effects for one in store.episodes) else None
+    units = units_of([store], skip_corrupt=True) if any(one.attributes.effects for one in store.episodes) else None
     size = 0
     with writing("recordings", path, "another --rrd"), progress_bar(len(episodes), "episodes") as advance:
         for episode in episodes:

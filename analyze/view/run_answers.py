@@ -14,8 +14,8 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import parse_episode_name
 
-#: Lines of episodes by their store's place and run, and by their name.
-KnownLines: TypeAlias = dict[tuple[str, str], dict[str, dict[str, Any]]]
+#: By place of the store and name, an episode and its line.
+KnownLines: TypeAlias = dict[tuple[str, str], tuple[StoredEpisode, dict[str, Any]]]
 
 
 def runs_answer(stores: Sequence[Store], known: KnownLines, with_paths: bool = False) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def runs_answer(stores: Sequence[Store], known: KnownLines, with_paths: bool = F
 
     Args:
         stores: of the runs.
-        known: lines that are not made again where the episode could be read; new ones are added.
+        known: lines that stay of an episode that is the same object and could be read; new ones are added.
         with_paths: also where the stores are on this machine, for commands to copy; sites of others do not say it.
     """
     counts = Counter(store.path.name for store in stores)
@@ -38,9 +38,15 @@ def runs_answer(stores: Sequence[Store], known: KnownLines, with_paths: bool = F
 
 
 def _run_answer(store: Store, known: KnownLines) -> dict[str, Any]:
-    root, lines = store.attributes, known.setdefault((str(store.path), store.run), {})
-    for episode in read_one_by_one(one for one in store.episodes if "failed" in lines.get(one.name, {"failed"})):
-        lines[episode.name] = episode_line(store, episode)
+    root, place = store.attributes, str(store.path)
+
+    def is_known(episode: StoredEpisode) -> bool:
+        kept, line = known.get((place, episode.name), (None, {}))
+        return kept is episode and "failed" not in line
+
+    new = [episode for episode in store.episodes if not is_known(episode)]
+    for episode, opened in zip(new, read_one_by_one(new), strict=True):
+        known[place, episode.name] = episode, episode_line(store, opened)
     return {
         "policy": visible(root.policy.name),
         "suite": root.protocol.suite,
@@ -57,7 +63,7 @@ def _run_answer(store: Store, known: KnownLines) -> dict[str, Any]:
             }
             for site in root.sites
         ],
-        "episodes": [lines[episode.name] for episode in store.episodes],
+        "episodes": [known[place, episode.name][1] for episode in store.episodes],
     }
 
 

@@ -16,9 +16,13 @@ from contextlib import suppress
 from typing import Any
 
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 _MODULE = "vla_attention.analyze.view.summary_process"
+#: What is said of the whole run.
+_OF_RUN = ("ratio", "findings", "leaves", "failed")
+#: How a line of the process begins that is for the reader.
+OURS = "summary "
 
 
 class Summary:
@@ -26,20 +30,28 @@ class Summary:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._episodes: dict[str, StoredEpisode] = {}
         self._rows: dict[str, dict[str, Any]] = {}
-        self._about: dict[str, Any] = dict.fromkeys(("ratio", "findings", "leaves", "failed"))
+        self._about: dict[str, Any] = dict.fromkeys(_OF_RUN)
         self._complete = False
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
 
     def begin(self, store: Store) -> None:
-        """Compute the summary of a store's episodes in the background; of another state of it, if one is under way."""
+        """Compute the summary of a store's episodes in the background; of another state of it, if one is under way.
+
+        Meanwhile the numbers of before stay: of episodes that are the same objects, and of the run while all are there.
+        """
         self.close()
         with self._lock:
-            empty = {one.name: {"name": one.name, "ratio": None, "lift": None} for one in store.episodes}
-            self._rows = {name: self._rows.get(name, row) for name, row in empty.items()}
+            before, self._episodes = self._episodes, {one.name: one for one in store.episodes}
+            kept = {name for name, one in self._episodes.items() if before.get(name) is one}
+            empty = {name: {"name": name, "ratio": None, "lift": None} for name in self._episodes}
+            self._rows = {name: self._rows[name] if name in kept else row for name, row in empty.items()}
             self._complete = False
             self._about["failed"] = None
+            if kept != before.keys():
+                self._about = dict.fromkeys(_OF_RUN)
         # The module is found as this process found it.
         variables = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.curdir for path in sys.path)}
         command = [sys.executable, "-m", _MODULE, str(store.path)]
@@ -75,7 +87,9 @@ class Summary:
         assert process.stdout is not None
         with process.stdout as lines:
             for line in lines:
-                self._take(json.loads(line))
+                # Other lines are of what Python loads there by itself, which may print too.
+                if line.startswith(OURS):
+                    self._take(json.loads(line.removeprefix(OURS)))
         code = process.wait()
         if process is self._process and code:
             self._fail("The numbers of the episodes could not be computed; vla-attention analyze STORE says why.")

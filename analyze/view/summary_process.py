@@ -23,6 +23,7 @@ from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.view.summaries import OURS
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import episode_name, parse_episode_name
@@ -39,11 +40,11 @@ def main(place: str) -> int:
     try:
         store = open_store(place)
         for part in summary_parts(store):
-            print(json.dumps(part, allow_nan=False), flush=True)
+            print(f"\n{OURS}{json.dumps(part, allow_nan=False)}", flush=True)
     except BrokenPipeError:
         return 1
     except UserError as error:
-        print(json.dumps({"failed": str(error)}), flush=True)
+        print(f"\n{OURS}{json.dumps({'failed': str(error)})}", flush=True)
     return 0
 
 

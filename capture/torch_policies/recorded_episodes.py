@@ -55,8 +55,8 @@ class Replan:
 class Episode:
     """An episode that is being recorded. Leaving its block without an exception stores it.
 
-    success: True, False, or None where it is not known. num_steps: number of executed actions; None: the last
-    environment step of a replan, and one. num_replans, num_dropped: recorded replan blocks, and blocks in which no
+    success: True, False, or None where it is not known. num_steps: number of executed actions; None: not known (0 in
+    the store). num_replans, num_dropped: recorded replan blocks, and blocks in which no
     attention ran (the policy answered from a queue).
     """
 
@@ -153,7 +153,6 @@ class Episode:
                 f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}. "
                 f"{no_attention(self.run.policy)}"
             )
-        last = writer.records[-1].env_step + 1
         facts = {
             **writer.start.provenance,
             "largest P·V error": f"{self.largest_error:.3g}",
@@ -163,7 +162,7 @@ class Episode:
         self.run._check_weights()
         # Environments give numpy's bools and numbers.
         success = None if self.success is None else bool(self.success)
-        num_steps = last if self.num_steps is None else whole_number("num_steps of an episode", self.num_steps)
+        num_steps = 0 if self.num_steps is None else whole_number("num_steps of an episode", self.num_steps)
         self.folder = writer.commit(success, num_steps)
         self.run.largest_error = max(self.run.largest_error, self.largest_error)
 

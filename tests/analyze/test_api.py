@@ -55,6 +55,16 @@ def run(store) -> OpenStores:
     return va.open(store)
 
 
+def test_one_name_is_no_list_of_letters(with_effects, store):
+    run = va.open(with_effects)
+    assert_frame_equal(run.effects(by="task")["effects_items"], run.effects(by=["task"])["effects_items"])
+    one = f"c=patch:{run.stores[0].attributes.policy.cameras[0].name}[0:1,0:2]"
+    run = va.open(store)
+    drawn = [run.overlay(tasks=0, replans=0, outline=given).figures for given in (one, [one])]
+    assert [figure.options["outlines"] for figure in drawn[0]] == [figure.options["outlines"] for figure in drawn[1]]
+    assert drawn[0][0].options["outlines"] == ["c"]
+
+
 def examples(module: ModuleType) -> list[doctest.DocTest]:
     return [test for test in doctest.DocTestFinder().find(module) if test.examples]
 

@@ -55,7 +55,8 @@ def _moves(found: pl.DataFrame, units: ActionUnits) -> Finding:
 def _towards(question: Question, units: ActionUnits) -> tuple[list[Finding], list[Table]]:
     if units.centimetres is None:
         return [], []
-    rows, unknown = directions(question.selected, things_of_sentences(question.stores), units.centimetres / 100)
+    names_of = things_of_sentences(question.stores, question.settings.skip_corrupt)
+    rows, unknown = directions(question.selected, names_of, units.centimetres / 100)
     if rows.is_empty():
         return [], []
     names = ("changed", "unchanged", "closer")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -369,6 +370,22 @@ def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
     assert found["unpaired"].height == 4
     assert "success" not in found["differences"]["quantity"].to_list()
     assert found["runs"].filter(run="rerun")["success_rate"].null_count() == found["runs"].filter(run="rerun").height
+
+
+@pytest.mark.parametrize("damaged", ["base", "rerun"])
+def test_a_damaged_episode_of_either_side_is_left_out_if_asked(tmp_path, damaged):
+    paths = {name: tmp_path / f"{name}.zarr" for name in ("base", "rerun")}
+    for path, kept in zip(paths.values(), ("cubes", "cubes_noise"), strict=True):
+        shutil.copytree(va.example(kept), path)
+    whole = va.open(paths["base"]).compare(paths["rerun"])["moved"]
+    (file,) = (paths[damaged] / "episodes" / "task002_episode000" / "actions").glob("c*")
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    file.write_bytes(content)
+    with pytest.raises(va.UserError, match="task002_episode000"):
+        va.open(paths["base"]).compare(paths["rerun"])
+    rest = va.open(paths["base"]).compare(paths["rerun"], skip_corrupt=True)["moved"]
+    assert rest["num_episodes"].item() == whole["num_episodes"].item() - 1
 
 
 def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):

@@ -18,7 +18,7 @@ from tests.kit.made_up_behaviour import COLOURS, did, goals_of
 from tests.kit.questions import question_about
 from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.commands.failures import failures
+from vla_attention.analyze.commands.failures import failures, foretold
 from vla_attention.analyze.core.behaviour import NO_TOUCH, OTHER_GOAL, OTHER_TOUCH, TOLD_SO, UNFINISHED
 from vla_attention.analyze.core.camera_maps import upright
 from vla_attention.analyze.core.courses import FEWEST, TOGETHER, band, by_replan, distance, leaves_at, path_of
@@ -136,6 +136,16 @@ def test_a_single_failure_that_touched_nothing(tmp_path):
 def test_what_the_task_alone_tells():
     found = failures(question_about(PAIR[0])).findings[-1]
     assert (found.numbers["right"], found.numbers["n"]) == (6, 6)
+
+
+def test_lengths_are_compared_with_those_of_solved_episodes_and_only_where_they_are_known():
+    for steps, said in (((25, 25, 25, 25), "2 of 2 failures and 2 of 2 solved"), ((25, 9, 0, 25), "")):
+        outcomes = pl.DataFrame(
+            {"suite": "s", "task_id": [0, 0, 1, 1], "solved": [True, False, False, True], "num_steps": steps}
+        )
+        (finding,) = foretold(outcomes)
+        assert said in finding.sentence
+        assert ("failures" in finding.sentence) == bool(said)
 
 
 def test_nothing_failed_is_said():

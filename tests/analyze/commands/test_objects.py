@@ -18,9 +18,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
+import vla_attention as va
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import OBJECTS, random_rows
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.objects import objects
@@ -325,3 +327,16 @@ def test_a_mistake_is_named(follower_store, tmp_path, capsys):
         error = capsys.readouterr().err
         assert re.search(named, error)
         assert "Traceback" not in error
+
+
+def test_pictures_of_robot_and_background_alone_say_so(tmp_path):
+    def background(task, episode, tokens):
+        rest = [thing.kind for thing in tokens.objects].index("background")
+        return {
+            name: np.eye(area.shape[-1], dtype=np.float32)[np.full(area.shape[:-1], rest)]
+            for name, area in tokens.coverage.items()
+        }
+
+    path = write_store(tmp_path / "a.zarr", spec=StoreSpec(tasks=(0, 1), episodes=1, plant_coverage=background))
+    (finding,) = va.open(path).objects().findings
+    assert finding.numbers == {"shown": 0}

@@ -121,3 +121,15 @@ def test_cells_hold_the_rollouts_of_a_sentence_in_a_scene(rollouts, found):
         assert cell["did_told"] == sum(row["did"] == row["told"] for row in own)
         assert cell["did_scene"] == sum(map(did_scene, own))
         assert cell["nothing"] == sum(row["did"] is None for row in own)
+
+
+def test_rollouts_that_do_not_count_have_their_own_reasons(rollouts):
+    reasons = ["it names no goal", "it held at the beginning", "it held at the beginning"]
+    rows = [
+        {**row, "told_goal": goal, "left_out": reason}
+        for row, reason, goal in zip(rollouts, reasons, (None, "a", "b"), strict=False)
+    ]
+    rows = [{**row, "scene_task_id": 1, "scene_goal": "goal_1"} for row in rows]
+    (finding,), _, _ = exchanged(pl.DataFrame(rows, schema_overrides={**SCHEMA, "left_out": pl.String}), Sampling())
+    assert "1 rollout (it names no goal)" in finding.limit
+    assert "2 rollouts (it held at the beginning)" in finding.limit

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urljoin
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 
 from tests.kit.http_ranges import serve
@@ -20,8 +23,10 @@ from tests.kit.stores import StoreSpec, root_attributes, write_episode, write_st
 from tests.kit.viewer import ask, ask_target, send, served
 from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.view.server import ViewerServer
+from vla_attention.analyze.view.summaries import Summary
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.stores.reader import open_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2)
@@ -204,6 +209,48 @@ def test_episodes_that_are_captured_meanwhile_are_listed(tmp_path):
         write_episode(open_run(path, root_attributes(SPEC), "resume"), SPEC, 0, 5)
         (found,) = json.loads(ask(running, "runs.json").body)["runs"]
         assert found["episodes"][-1]["name"] == "task000_episode005"
+
+
+def told(running: ViewerServer) -> tuple[list[bool | None], list[float | None]]:
+    """Outcomes and ratios of the episodes that the page lists, when all is computed."""
+    (found,) = json.loads(ask(running, "runs.json").body)["runs"]
+    running.stores[0].summary.wait()
+    numbers = json.loads(ask(running, "runs/0/numbers.json").body)
+    assert numbers["complete"]
+    assert numbers["failed"] is None
+    return [one["outcome"] for one in found["episodes"]], [one["ratio"] for one in numbers["episodes"]]
+
+
+def test_a_store_that_was_replaced_under_its_name_is_shown_as_it_is_now(tmp_path):
+    """The same run again, with the same episodes: another outcome, other rows, other effects."""
+
+    def other_rows(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+        rows = rows.copy()
+        rows[..., :4] *= 3.0
+        return rows / rows.sum(axis=-1, keepdims=True)
+
+    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, plant_success=lambda *_: True))
+    with served(path) as running:
+        running.stores[0].summary.begin(running.stores[0].store)
+        outcomes, ratios = told(running)
+        about = ask(running, "runs/0/task000_episode000/about.json").body
+        assert outcomes == [True, True]
+        shutil.rmtree(path)
+        write_store(path, spec=replace(SPEC, plant_success=lambda *_: False, plant_rows=other_rows))
+        now, new_ratios = told(running)
+        assert now == [False, False]
+        assert None not in new_ratios
+        assert not set(new_ratios) & set(ratios)
+        assert ask(running, "runs/0/task000_episode000/about.json").body != about
+
+
+def test_what_python_prints_by_itself_does_not_end_the_summary(store, tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text("print('[1]'); print('{}'); print('loaded', end='')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    summary = Summary()
+    summary.begin(open_store(store))
+    assert summary.wait() is None
+    assert None not in [one["ratio"] for one in summary.document()["episodes"]]
 
 
 def test_a_store_that_goes_away_is_a_sentence(tmp_path, store):

@@ -179,7 +179,7 @@ def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
     assert episode.read("noise_seed").tolist() == [7, 7]
     assert episode.read("env_step").tolist() == [0, 5]
     assert episode.attributes.success is True
-    assert episode.attributes.num_steps == 6
+    assert episode.attributes.num_steps == 0  # the loop did not say it
     assert (episode.attributes.task_name, episode.attributes.task_family) == ("bowl", "pick A")
     np.testing.assert_array_equal(episode.read("actions")[1], policy.act(**given(seed=1))[0].double().numpy())
     np.testing.assert_allclose(episode.read("state")[1], given(seed=1)["states"][0].numpy())
