@@ -243,9 +243,9 @@ FAULTS = (
     ),
     Fault(
         "masked softmax: a query that its mask leaves no key sees all",
-        "capture/torch_policies/softmax_calls.py",
+        "capture/torch_policies/call_tensors.py",
         "(logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)",
-        "logits > highest + MASKED_BELOW",
+        "(logits > highest + MASKED_BELOW)",
         ("tests/capture/torch_policies/test_softmax_calls.py",),
     ),
     Fault(

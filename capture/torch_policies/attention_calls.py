@@ -21,9 +21,14 @@ from vla_attention.schemas.errors import BadArgument
 #: multiplied with values. `multihead`: `multi_head_attention_forward`, which `nn.MultiheadAttention` calls. `flex`:
 #: `flex_attention`. transformers' attention interface calls one of these.
 Kind = Literal["sdpa", "softmax", "multihead", "flex"]
-#: Logits at or below this are of masked keys: masks are written as -inf, as the lowest number of a dtype, as -1e9, or
-#: as -1e4, the smallest in use.
+#: Logits this far below the highest one of their row, or below 0, are of masked keys: masks are written as -inf, as the
+#: lowest number of a dtype, as -1e9 or -1e4.
 MASKED_BELOW = -5000.0
+#: Keys this far below the highest one for every head are masked too: -100 is in use (Swin), and nothing that is read is
+#: so far below for all heads at once.
+MASK_DISTANCE = 80.0
+#: Probabilities below this are none: such a mask leaves 1e-35 at most.
+NO_MASS = 1e-30
 #: Largest difference of numbers that are computed twice, relative to the largest of them, by the least precise dtype. A
 #: float32 kernel leaves 1e-6, one of bfloat16 a few of its roundings; rows with a wrong mask are off by far more.
 TOLERANCE = {"float32": 1e-3, "float64": 1e-3, "float16": 2e-2, "bfloat16": 6e-2}
@@ -107,7 +112,7 @@ class AttentionCall:
 
     def _check_refused(self) -> None:
         if self.refused:
-            raise RowsRefused(f"The attention call {self.shape} cannot be recorded: it {self.refused}.")
+            refuse_rows(self.shape, self.refused)
 
     def allowed(self, queries: slice = slice(None)) -> Tensor:
         """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see.
@@ -168,6 +173,11 @@ class AttentionCall:
         return ""
 
 
+def refuse_rows(shape: CallShape, why: str) -> None:
+    """Raise `RowsRefused` for a call; why: in words that follow "it"."""
+    raise RowsRefused(f"The attention call {shape} cannot be recorded: it {why}.")
+
+
 class Watcher:
     """Is told about every attention call of a watched block, in order. This one takes and changes nothing.
 
@@ -188,6 +198,10 @@ class Watcher:
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Take what is wanted of a call, right after its kernel; in order. Return whether its output is followed."""
+
+    def refuse(self, shape: CallShape, why: str) -> None:
+        """Learn that a call that was seen has no rows, as its output's way shows."""
+        refuse_rows(shape, why)
 
 
 def exact() -> AbstractContextManager[object]:

@@ -8,10 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.interventions.factors import check_keys_left
-from vla_attention.capture.torch_policies.attention_calls import (
-    MASKED_BELOW,
-    CallShape,
-)
+from vla_attention.capture.torch_policies.attention_calls import MASK_DISTANCE, MASKED_BELOW, CallShape
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -45,10 +42,25 @@ def causal_mask(queries: Tensor, keys: int) -> Tensor:
     return torch.arange(keys, device=queries.device)[None, :] <= queries[:, None]
 
 
+def visible(logits: Tensor) -> Tensor | None:
+    """Return the keys that a mask lets a query see, (batch, head, query, key) bool; None where these are all.
+
+    logits: (batch, head, query, key) with the mask, or the mask alone.
+    """
+    logits = logits.float()
+    highest = logits.amax(-1, keepdim=True)
+    if bool(logits.amin() > highest.amax() - MASK_DISTANCE):
+        return None
+    near = (logits > highest - MASK_DISTANCE) & (highest > MASKED_BELOW)
+    return (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW) & near.any(dim=1, keepdim=True)
+
+
 def check_change(before: Tensor, after: Tensor, shape: CallShape) -> None:
     """Raise `QueryWithoutKeys` if a query that had a key has none after a change; logits (batch, head, query, key)."""
-    lost = (before.amax(-1) > MASKED_BELOW) & (after.amax(-1) <= MASKED_BELOW)
-    check_keys_left(lost, f"the attention call {shape}")
+    highest = before.amax(-1, keepdim=True)
+    seen = highest > MASKED_BELOW if (mask := visible(before)) is None else mask
+    left = seen & (after > highest + MASKED_BELOW)
+    check_keys_left(seen.any(-1) & ~left.any(-1), f"the attention call {shape}")
 
 
 #: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).

@@ -16,10 +16,7 @@ from torch import Tensor, nn
 from torch._higher_order_ops.flex_attention import flex_attention as flex_operator
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from vla_attention.capture.torch_policies.attention_calls import (
-    MASKED_BELOW,
-    AttentionCall,
-)
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_tensors import (
     batch_and_heads,
     causal_mask,
@@ -29,6 +26,7 @@ from vla_attention.capture.torch_policies.call_tensors import (
     normalised,
     part,
     query_key_logits,
+    visible,
 )
 
 if TYPE_CHECKING:
@@ -117,7 +115,8 @@ def watch_sdpa(
         seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=query.device)
         if mask is not None:
             chosen = part(mask, wanted, slice(None))
-            seen = seen & (chosen if chosen.dtype is torch.bool else chosen > MASKED_BELOW)
+            unmasked = chosen if chosen.dtype is torch.bool else visible(chosen)
+            seen = seen if unmasked is None else seen & unmasked
         return seen & causal_mask(numbers, keys) if given.is_causal else seen
 
     folded = output.detach().reshape(batch, heads, queries, given.value.shape[-1])
@@ -189,15 +188,22 @@ def watch_flex(
         chosen = zip((batch, heads, queries, keys), (rows, slice(None), wanted, slice(None)), strict=True)
         return [torch.arange(size, device=query.device)[some] for size, some in chosen]
 
-    def allowed_of(wanted: slice, rows: slice = slice(None)) -> Tensor:
+    def in_blocks(wanted: slice, rows: slice) -> Tensor:
         numbers = places(wanted, rows)
         seen = _over_places(given["block_mask"][-1], ())(*numbers, *given[buffers[1]])
         return seen.expand([len(axis) for axis in numbers])
 
+    def allowed_of(wanted: slice) -> Tensor:
+        seen = in_blocks(wanted, slice(None))
+        # A score function may mask, too: by what it makes of zeros.
+        zeros, numbers = seen.new_zeros(seen.shape, dtype=torch.float32), places(wanted, slice(None))
+        unmasked = visible(_over_places(score, (0,))(zeros, *numbers, *given[buffers[0]]))
+        return seen if unmasked is None else seen & unmasked
+
     def logits_of(wanted: slice, rows: slice) -> Tensor:
         logits = query_key_logits(kept_query[rows, :, wanted], kept_key[rows], given["scale"])
         logits = _over_places(score, (0,))(logits, *places(wanted, rows), *given[buffers[0]])
-        return logits.masked_fill(~allowed_of(wanted, rows), float("-inf"))
+        return logits.masked_fill(~in_blocks(wanted, rows), float("-inf"))
 
     change = mode.change(shape)
     if change is None:

@@ -157,6 +157,9 @@ class _Shapes(Watcher):
         cache = self.caches.problem(call, call.shape.module)
         self.refused.append(f"its rows {unfit}" if unfit else cache)
 
+    def refuse(self, shape: CallShape, why: str) -> None:
+        self.errors[shape.number], self.refused[shape.number] = float("nan"), f"it {why}"
+
 
 def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[], object] | None = None) -> CallTable:
     """Return a table of every attention call that `call()` makes in `policy`; printed, it fits a screen.

@@ -12,7 +12,7 @@ scaled or projected and then added once more, it was none (a value residual, a g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
@@ -54,6 +54,12 @@ _OF_NONE = {
     "zeros_like", "ones_like", "empty_like", "full_like", "randn_like",
     "new_zeros", "new_ones", "new_empty", "new_full",
 }  # fmt: skip
+
+
+def used_tensors(name: str, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Iterator[Tensor]:
+    """Yield the tensors whose numbers a function may use; name: its own without underscores."""
+    given = () if name in _OF_NONE else args[:1] if name in _OF_THE_FIRST and args else (*args, *kwargs.values())
+    return tensors_among(given)
 
 
 @dataclass(frozen=True)
@@ -169,8 +175,8 @@ class OutputWays:
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], run: Callable[[], Any]) -> Any:
         """Run a function, and note what its result is to the outputs that are followed."""
         name = getattr(function, "__name__", "").strip("_")
-        given = () if name in _OF_NONE else args[:1] if name in _OF_THE_FIRST and args else (*args, *kwargs.values())
-        known = [(tensor, steps) for tensor in tensors_among(given) if (steps := self._table.get(tensor)) is not None]
+        used = used_tensors(name, args, kwargs)
+        known = [(tensor, steps) for tensor in used if (steps := self._table.get(tensor)) is not None]
         if not known:
             return run()
         call = _Call(name, function, args, kwargs)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vla_attention.capture.recording.finite_numbers import not_finite
 from vla_attention.capture.store.replan_records import RecordedRows
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import NO_MASS, AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
@@ -181,7 +181,7 @@ class ReplanRecorder(CallOrder):
             )
         if self.layout.autoregressive and (problem := self._caches.problem(call, (site.name, place.block))):
             self.problems[f"of a call of site '{site.name}', {problem}"] = None
-        seen = call.allowed(queries)
+        rows, seen = torch.threshold(rows, NO_MASS, 0.0), call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
         way, by_part = None, recording.contributions
         if by_part or self.asks_of_batch:

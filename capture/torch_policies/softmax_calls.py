@@ -9,27 +9,24 @@ of a mixture of experts) is no attention call.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from vla_attention.capture.torch_policies.attention_calls import (
-    MASKED_BELOW,
-    AttentionCall,
-    CallShape,
-    exact,
-)
+from vla_attention.capture.torch_policies.attention_calls import NO_MASS, AttentionCall, CallShape, exact
 from vla_attention.capture.torch_policies.call_tensors import (
     ChangeRefused,
     batch_and_heads,
     check_change,
     fitted_change,
     normalised,
+    visible,
 )
+from vla_attention.capture.torch_policies.output_ways import used_tensors
 from vla_attention.capture.torch_policies.tensor_table import TensorTable, tensors_among
 
 if TYPE_CHECKING:
@@ -40,7 +37,7 @@ SOFTMAXES: tuple[Callable[..., Any], ...] = (
     torch.nn.functional.softmax, torch.softmax, Tensor.softmax, torch.special.softmax, torch._safe_softmax,
     torch.ops.aten.softmax, torch.ops.aten.softmax.int, torch.ops.aten._softmax, torch.ops.aten._softmax.default,
 )  # fmt: skip
-_PRODUCTS = {
+PRODUCTS = {
     torch.matmul, torch.bmm, Tensor.matmul, Tensor.bmm, Tensor.__matmul__, Tensor.__rmatmul__, torch.linalg.matmul,
     torch.ops.aten.matmul, torch.ops.aten.matmul.default, torch.ops.aten.bmm, torch.ops.aten.bmm.default, torch.einsum,
 }  # fmt: skip
@@ -55,6 +52,16 @@ _VALUES_BY_QUERY = (
     "gives every query keys and values of its own (as gathered ones), so that no key has a place that a layout can "
     "name. Give the call a rule without a site"
 )
+_LINEAR_ATTENTION = (
+    "is one of two products in a row, as of linear attention: the keys or the queries of this one are channels and no "
+    "tokens. Give the call a rule without a site"
+)
+#: Functions that mix axes or add other things: what they make of a softmax's result are no probabilities.
+_ENDS = {
+    "linear", "bilinear", "conv1d", "conv2d", "conv3d", "conv_transpose1d", "conv_transpose2d", "conv_transpose3d",
+    "mm", "mv", "addmm", "addmv", "addbmm", "baddbmm", "tensordot",
+}  # fmt: skip
+_SUMS = {"add", "radd", "iadd", "sub", "rsub", "isub", "addcmul", "lerp"}
 #: Functions that change the order on an axis, as indices by tensors do too.
 _REORDERS = {"index_select", "gather", "take_along_dim", "flip", "fliplr", "flipud", "rot90", "roll"}
 
@@ -63,15 +70,24 @@ _REORDERS = {"index_select", "gather", "take_along_dim", "flip", "fliplr", "flip
 class _Softmax:
     """A softmax whose result has not met values yet.
 
-    logits: what it took; before: the same without the watcher's change. changed: whether there is one. reordered:
-    whether what is followed went through a function that changes the order of keys, heads or rows.
+    logits: what it took; before: the same without the watcher's change. change: that one, (batch or 1, head or 1, query
+    or 1, key or 1). reordered: whether what is followed went through a function that changes the order of keys, heads
+    or rows.
     """
 
     shape: CallShape
     logits: Tensor
     before: Tensor
-    changed: bool
+    change: Tensor | None
     reordered: bool = False
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A product of two activations; of an attention call that was taken its shape, and the axis of its queries."""
+
+    call: CallShape | None = None
+    queries: int = -1
 
 
 class Softmaxes:
@@ -84,6 +100,8 @@ class Softmaxes:
         self.entries = self._followed.entries
         #: What else the policy computed of a softmax's result, such as its product with relative positions.
         self._beside: TensorTable[_Softmax] = TensorTable()
+        #: Products of two activations, and what was computed of them alone.
+        self._products: TensorTable[_Made] = TensorTable()
         #: Softmaxes that were changed and met no values yet.
         self.changed: list[CallShape] = []
 
@@ -113,40 +131,61 @@ class Softmaxes:
             name = "self" if "self" in kwargs else "input"
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
             self.changed.append(shape)
-        self._followed.put(result, _Softmax(shape, given.detach(), logits.detach(), change is not None))
+        self._followed.put(result, _Softmax(shape, given.detach(), logits.detach(), change))
         return result
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run any other function, and follow what comes of a softmax's result."""
         result = function(*args, **kwargs)
-        for given in tensors_among((*args, *kwargs.values())):
+        name = getattr(function, "__name__", "").strip("_")
+        tensors = list(used_tensors(name, args, kwargs))
+        for given in tensors:
             softmax = self._followed.get(given)
             if softmax is None:
                 continue
-            if function in _PRODUCTS:
+            if function in PRODUCTS:
                 self._beside.put(result, softmax)
                 self._product(function, args, kwargs, given, softmax, result)
+            elif isinstance(result, Tensor) and (name in _ENDS or (name in _SUMS and self._adds(tensors, result))):
+                self._followed.entries.pop(id(result), None)  # it may be written in place
+                self._beside.put(result, softmax)
             elif isinstance(result, Tensor) and result is not given and result.is_floating_point() and result.ndim:
                 # Some keys may be cut off, as those of attention sinks are.
                 fewer = result.ndim == given.ndim and sum(a != b for a, b in zip(result.shape, given.shape)) == 1  # noqa: B905
                 if result.numel() == given.numel() or (fewer and result.numel() < given.numel()):
-                    reordered = softmax.reordered or _reorders(function, args)
+                    reordered = softmax.reordered or _reorders(name, args)
                     self._followed.put(result, replace(softmax, reordered=reordered))
                 else:
                     self._beside.put(result, softmax)
             break
+        if function in PRODUCTS:
+            self._note_product(function, args, kwargs, result)
+        elif name not in _ENDS | _SUMS and any(self._products.get(given) for given in tensors):
+            for made in tensors_among((result,)):
+                self._products.put(made, self._products.get(made) or _Made())
         return result
+
+    def _note_product(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], result: Tensor) -> None:
+        """Note a product of two activations, and refuse the attention call whose queries it sums over."""
+        operands, letters = _operands(function, args, kwargs)
+        weights = any(isinstance(operand, nn.Parameter) for operand in operands)
+        if letters is None or weights or letters[0][0] != letters[1][0] or letters[0][0] not in letters[2]:
+            return
+        for place, operand in enumerate(operands):
+            made, partner = self._products.get(operand) or _Made(), operands[1 - place]
+            if made.call and letters[place][made.queries] not in letters[2] and self._followed.get(partner) is None:
+                self._mode.refuse(made.call, _LINEAR_ATTENTION)
+        self._products.put(result, self._products.get(result) or _Made())
+
+    def _adds(self, tensors: Sequence[Tensor], result: Tensor) -> bool:
+        """Whether a sum adds something as large that comes of no softmax."""
+        return any(tensor.numel() == result.numel() and self._followed.get(tensor) is None for tensor in tensors)
 
     def _product(
         self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], given: Tensor, softmax: _Softmax,
         result: Tensor,
     ) -> None:  # fmt: skip
-        operands = list(tensors_among((*args, *kwargs.values())))
-        if function is Tensor.__rmatmul__:
-            operands.reverse()
-        if len(operands) != 2:
-            return
-        letters = _letters(args[0] if function is torch.einsum else None, operands[0].ndim, operands[1].ndim)
+        operands, letters = _operands(function, args, kwargs)
         if letters is None:
             return
         place = 0 if operands[0] is given else 1
@@ -163,25 +202,37 @@ class Softmaxes:
         kv_heads = math.prod(multiplied.shape[: product.num_lead_of_values]) // sizes[0]
         before = softmax.shape
         shape = replace(
-            before, batch=sizes[0], heads=sizes[1], kv_heads=kv_heads, queries=sizes[2], keys=keys
+            before, number=self._mode.number, batch=sizes[0], heads=sizes[1], kv_heads=kv_heads, queries=sizes[2],
+            keys=keys,
         )  # fmt: skip
-        if softmax.changed and sizes != (before.batch, before.heads, before.queries):
+        memory = value.untyped_storage().data_ptr()
+        linear = any(made.untyped_storage().data_ptr() == memory for made in self._products.tensors(lambda _: True))
+        refused = _LINEAR_ATTENTION if linear else ""
+        refused = _VALUES_BY_QUERY if kv_heads > sizes[1] else refused
+        if softmax.change is not None and (
+            refused
+            or sizes != (before.batch, before.heads, before.queries)
+            or not _is_changed(multiplied, softmax, given, product, softmax.change)
+        ):
             raise self._mode.failed(
                 ChangeRefused(
-                    f"The attention call {before} cannot be changed: its product with the values shows other axes "
-                    f"(batch {sizes[0]}, {sizes[1]} heads, {sizes[2]} queries) than the softmax. Leave this call out."
+                    f"The attention call {before} cannot be changed: it {refused}."
+                    if refused
+                    else f"The attention call {before} cannot be changed: its product with the values shows other axes "
+                    f"(batch {sizes[0]}, {sizes[1]} heads, {sizes[2]} queries) than the softmax, or shows them in "
+                    "another order, as (batch, query, head, key). Leave this call out of the change (layers), change "
+                    "all heads and queries alike, or compute the softmax over (batch, head, query, key)."
                 )
             )
         if self._mode.passes(shape):
             return
         with exact():
-            rows, allowed, refused = _decided(multiplied, softmax, given, product)
-            refused = _VALUES_BY_QUERY if kv_heads > sizes[1] else refused
-            rows = rows.reshape(*sizes, keys)
+            rows, allowed, unknown = _decided(multiplied, softmax, given, product, (*sizes, keys))
             seen = rows.new_ones((), dtype=torch.bool).expand(sizes[0], 1, sizes[2], keys)
-            seen = seen if allowed is None else allowed.reshape(*sizes, keys)
+            seen = seen if allowed is None else allowed
             values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, keys, dim)
         back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
+        self._products.put(result, _Made(shape, product.output.index(len(product.rows) - 2)))
         self._mode.saw(
             AttentionCall(
                 shape,
@@ -191,47 +242,102 @@ class Softmaxes:
                 lambda queries: seen[:, :, queries],
                 lambda mixed: mixed.reshape(*multiplied.shape[:-1], dim).permute(product.output),
                 given.dtype,
-                None if shape == replace(before, kv_heads=kv_heads) else before,
-                refused,
+                None if shape == replace(before, number=shape.number, kv_heads=kv_heads) else before,
+                refused or unknown,
             ),
             [
                 tensor
                 for table in (self._followed, self._beside)
-                for tensor in table.tensors(lambda other: other.logits is softmax.logits)
+                for tensor in table.tensors(lambda other: getattr(other, "logits", None) is softmax.logits)
             ],
         )
 
 
-def _reorders(function: Any, args: tuple[Any, ...]) -> bool:
-    name = getattr(function, "__name__", "").strip("_")
+def _operands(
+    function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]
+) -> tuple[list[Tensor], tuple[str, str, str] | None]:
+    """Return the operands of a product, and its letters (see `_letters`); None where they cannot be told."""
+    operands = list(tensors_among((*args, *kwargs.values())))
+    if function is Tensor.__rmatmul__:
+        operands.reverse()
+    if len(operands) != 2:
+        return operands, None
+    return operands, _letters(args[0] if function is torch.einsum else None, operands[0].ndim, operands[1].ndim)
+
+
+def _reorders(name: str, args: tuple[Any, ...]) -> bool:
     indices = args[1] if name == "getitem" else ()
     indices = indices if isinstance(indices, tuple) else (indices,)
     plain = (int, slice, type(None), type(Ellipsis))
     return name in _REORDERS or not all(isinstance(index, plain) for index in indices)
 
 
-def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[Tensor, Tensor | None, str]:
-    """Return the rows of a product (*lead, query, key) float32, the keys that the mask allows, and why it is refused.
+def _wide(logits: Tensor) -> Tensor:
+    return logits.to(torch.promote_types(logits.dtype, torch.float32))
 
-    rows: the probabilities as they are multiplied. No mask is None.
+
+def _rounding(rows: Tensor, softmax: _Softmax) -> float:
+    return max(torch.finfo(dtype).eps for dtype in (rows.dtype, softmax.logits.dtype))
+
+
+def _are_equal(rows: Tensor, expected: Tensor, rounding: float) -> bool:
+    """Whether probabilities are the expected ones, up to rounding."""
+    beyond = (rows.float() - expected).abs_().sub_(expected, alpha=max(2 * rounding, 1e-4))
+    return bool(beyond.amax() <= max(rounding / 100, 1e-6))
+
+
+def _is_changed(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product, change: Tensor) -> bool:
+    """Whether the rows of a product (*lead, query, key) are changed in the cells (batch, head, query, key) of a change.
+
+    Cut cells are 0, and the others what the softmax gives of its logits without them. Where something else than what
+    the softmax gave is multiplied, that is looked at for cut cells; factors must be the same in any order of the axes.
     """
-    expected = normalised(softmax.logits.to(torch.promote_types(softmax.logits.dtype, torch.float32)))
-    rounding = max(torch.finfo(dtype).eps for dtype in (rows.dtype, softmax.logits.dtype))
-    narrow = torch.finfo(rows.dtype).bits < 32
+    shape = softmax.shape
+    with exact():
+        for arrange in _arrangements(softmax.before, given):
+            before = arrange(softmax.before).permute(product.rows)
+            changed = before.reshape(shape.batch, shape.heads, shape.queries, -1) + change.to(before.dtype)
+            if _are_equal(rows, normalised(_wide(changed)).reshape(rows.shape), _rounding(rows, softmax)):
+                return True
+        if _arranged(rows, softmax, given, product) is not None:
+            return False
+        cut = (change == float("-inf")).expand(shape.batch, shape.heads, shape.queries, rows.shape[-1])
+        factors = change.masked_fill(change == float("-inf"), 0.0)
+        alike = bool((factors == factors[:, :1, :1]).all())
+        return alike and not bool(rows.reshape(cut.shape).masked_select(cut).any())
+
+
+def _arranged(
+    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product
+) -> tuple[Callable[[Tensor], Tensor], Tensor] | None:
+    """Return how the softmax's axes became those of a product, and its probabilities so; None where it is not known."""
+    expected = normalised(_wide(softmax.logits))
     for arrange in _arrangements(expected, given):
         arranged = arrange(expected).permute(product.rows)
+        if _are_equal(rows, arranged, _rounding(rows, softmax)):
+            return arrange, arranged
+    return None
+
+
+def _decided(
+    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product, sizes: tuple[int, ...]
+) -> tuple[Tensor, Tensor | None, str]:
+    """Return the rows of a product float32, the keys that the mask allows, and why it is refused.
+
+    rows: the probabilities as they are multiplied, (*lead, query, key). sizes: batch, heads, queries and keys, in which
+    rows and allowed keys are returned. No mask is None.
+    """
+    narrow, rounding = torch.finfo(rows.dtype).bits < 32, _rounding(rows, softmax)
+    known = _arranged(rows, softmax, given, product)
+    if known is not None:
+        arrange, arranged = known
+        logits = arrange(softmax.before).permute(product.rows).reshape(sizes)
         # Rounded to the compute precision, probabilities would not sum to 1.
-        beyond = (rows.float() - arranged).abs_().sub_(arranged, alpha=max(2 * rounding, 1e-4))
-        if bool(beyond.amax() <= max(rounding / 100, 1e-6)):
-            logits = arrange(softmax.before).permute(product.rows).float()
-            highest = logits.amax(-1, keepdim=True)
-            allowed = None
-            if not bool(logits.amin() > highest.amax() + MASKED_BELOW):
-                allowed = (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)
-            return arranged if narrow else rows.float(), allowed, ""
+        return (arranged if narrow else rows.float()).reshape(sizes), visible(logits), ""
     # Something else is multiplied than what the softmax gave, or its logits were written over: then a key that has any
-    # mass is seen.
-    rows, refused = rows.float(), ""
+    # mass is seen. In float16 nothing tells, for keys that are seen may have none.
+    expected = normalised(_wide(softmax.logits))
+    half, rows, refused = rows.dtype is torch.float16, rows.float(), ""
     if rows.numel() == expected.numel():
         ours, theirs = (tensor.flatten().sort().values for tensor in (expected, rows))
         same_numbers = torch.allclose(theirs, ours, rtol=max(2 * rounding, 1e-4), atol=rounding / 100)
@@ -240,7 +346,8 @@ def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -
     if narrow:
         sums = rows.sum(dim=-1, keepdim=True)
         rows = rows / torch.where((sums - 1).abs() < _ROUNDING, sums, 1.0)
-    return rows, (rows > 0).expand(rows.shape), refused
+    rows = rows.reshape(sizes)
+    return rows, None if half else (rows > 0) & (rows > NO_MASS).any(dim=1, keepdim=True), refused
 
 
 def _arrangements(expected: Tensor, given: Tensor) -> list[Callable[[Tensor], Tensor]]:

@@ -24,7 +24,7 @@ from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.fused_calls import FLEX_FUNCTIONS, SDPA_FUNCTIONS, watch_flex, watch_sdpa
 from vla_attention.capture.torch_policies.output_ways import OutputWay, OutputWays
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
-from vla_attention.capture.torch_policies.softmax_calls import SOFTMAXES, Softmaxes
+from vla_attention.capture.torch_policies.softmax_calls import PRODUCTS, SOFTMAXES, Softmaxes
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
 from vla_attention.schemas.errors import BadArgument, UserError
 
@@ -69,10 +69,12 @@ class AttentionMode(TorchFunctionMode):
             **dict.fromkeys(SDPA_FUNCTIONS, lambda *call: watch_sdpa(self, *call)),
             **dict.fromkeys(FLEX_FUNCTIONS, lambda *call: watch_flex(self, *call)),
             **dict.fromkeys(SOFTMAXES, self._softmaxes.softmax),
+            **dict.fromkeys(PRODUCTS, self._softmaxes.follow),
         }
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self._error: BaseException | None = None
-        self._number = 0
+        #: Of the attention call that comes next.
+        self.number = 0
         #: Heads of `nn.MultiheadAttention` while it runs, 0 otherwise.
         self._multihead_heads = 0
         self._way: OutputWay | None = None
@@ -155,7 +157,7 @@ class AttentionMode(TorchFunctionMode):
             kind, batch, heads = "multihead", batch * heads // self._multihead_heads, self._multihead_heads
             kv_heads = heads
         return CallShape(
-            module=module, kind=kind, number=self._number, batch=batch, heads=heads, kv_heads=kv_heads,
+            module=module, kind=kind, number=self.number, batch=batch, heads=heads, kv_heads=kv_heads,
             queries=queries, keys=keys, dtype=str(dtype).removeprefix("torch."),
         )  # fmt: skip
 
@@ -169,19 +171,22 @@ class AttentionMode(TorchFunctionMode):
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is none of the watcher's, and count it then."""
         with self._failing():
-            passed = self._watcher.passes(replace(shape, number=self._number))
-        self._number += passed
+            passed = self._watcher.passes(replace(shape, number=self.number))
+        self.number += passed
         return passed
 
     def saw(self, call: AttentionCall, probabilities: Sequence[Tensor] = ()) -> None:
         """Tell the watcher about a call, and count it; probabilities: tensors that the policy may use once more."""
-        if call.shape.number != self._number:  # another call came between a softmax and its product
-            call = replace(call, shape=replace(call.shape, number=self._number))
         with self.computing():
-            self._number += 1
+            self.number += 1
             self._way = self._watcher.saw(call)
         if self._way is not None:
             self.outputs.note_other_use(self._way, probabilities)
+
+    def refuse(self, shape: CallShape, why: str) -> None:
+        """Tell the watcher that a call that it took has no rows, in words that follow "it"."""
+        with self._failing():
+            self._watcher.refuse(shape, why)
 
     @contextmanager
     def computing(self) -> Iterator[None]:

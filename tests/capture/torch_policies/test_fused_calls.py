@@ -257,3 +257,17 @@ def test_a_change_takes_keys_away_from_flex_attention():
     torch.testing.assert_close(second.rows[1], left / left.sum(-1, keepdim=True), rtol=1e-5, atol=1e-6)
     assert max(second.errors) < 2e-6
     assert torch.equal(first.allowed[1], second.allowed[1])
+
+
+@pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")
+@pytest.mark.parametrize("low", [-30.0, -100.0, float("-inf")])
+def test_a_score_function_of_flex_attention_may_mask(low):
+    torch.manual_seed(0)
+    policy = Policy(
+        lambda q, k, v, m: flex_attention(q, k, v, score_mod=lambda s, b, h, i, j: torch.where(j == 3, s + low, s))
+    )
+    seen = Seen()
+    with watch_attention(policy.eval().requires_grad_(False), seen):
+        policy(torch.randn(1, 5, 32), torch.randn(1, 7, 32))
+    wanted = (torch.arange(7) != 3) | (low == -30.0)
+    assert torch.equal(seen.allowed[0], wanted.expand(1, 4, 5, 7))

@@ -11,9 +11,11 @@ import torch
 from msgspec.structs import replace
 from torch import Tensor, nn
 
+from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.torch_policies.attention_calls import RowsRefused
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
+from vla_attention.capture.torch_policies.inspect_calls import inspect
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import ContributionsUnknown, WeightsChanged
@@ -99,7 +101,7 @@ def layout(**changes: object) -> PolicyLayout:
 
 def rows_of(path, policy, act=None, cut=None, shape=None, contributions=True):
     """Record one call; return its rows (block, head, query, key) and what it gave."""
-    changes = None if cut is None else knockout(cut)
+    changes = knockout(cut) if isinstance(cut, str) else cut
     with (
         record(
             path / "a.zarr",
@@ -216,6 +218,131 @@ def test_a_knockout_does_not_change_a_gate_of_experts(tmp_path, experts):
     else:
         rows, _ = rows_of(tmp_path / "knockout", policy, cut="role:state")
         np.testing.assert_allclose(rows, expected(policy, (4, 5)), atol=2e-6)
+
+
+def queries_first(block, q, k, v):
+    """Softmax over (batch, query, head, key)."""
+    scores = torch.einsum("bhqd,bkhd->bqhk", q, k.transpose(1, 2)) / math.sqrt(DIM)
+    return torch.einsum("bqhk,bhkd->bhqd", torch.softmax(scores, dim=-1), v)
+
+
+def sharpened(block, q, k, v):
+    """What is multiplied is not what the softmax gave."""
+    rows = torch.softmax(logits(q, k), dim=-1).square()
+    return rows / rows.sum(-1, keepdim=True) @ v
+
+
+@pytest.mark.parametrize("heads", [None, [1]])
+@pytest.mark.parametrize("attend", [by_hand, queries_first, sharpened])
+def test_a_knockout_hits_the_heads_and_queries_that_it_names(tmp_path, attend, heads):
+    """With as many queries as heads, the sizes of the axes do not tell which is which."""
+    policy, cut = OddPolicy(attend, heads=ACTIONS), knockout("role:state", heads=heads)
+    shape = layout(num_heads=ACTIONS)
+    if attend is queries_first and heads:
+        with pytest.raises(ChangeRefused):
+            rows_of(tmp_path, policy, cut=cut, shape=shape)
+        return
+    rows, _ = rows_of(tmp_path, policy, cut=cut, shape=shape)
+    kept = torch.stack([block.kept[0] for block in policy.blocks])
+    if attend is sharpened:
+        kept = 2 * kept
+    kept[:, slice(None) if heads is None else heads, :, 4:6] = -math.inf
+    np.testing.assert_allclose(rows, kept.softmax(-1).numpy(), atol=2e-6)
+
+
+def test_a_knockout_of_some_queries_is_refused_where_they_may_be_heads(tmp_path):
+    sites = tuple(replace(site, action_queries=(-2, None)) for site in layout().sites)
+    shape = layout(num_heads=ACTIONS, sites=sites)
+    with pytest.raises(ChangeRefused):
+        rows_of(tmp_path, OddPolicy(queries_first, heads=ACTIONS), cut="role:state", shape=shape)
+
+
+#: With as many channels as the layout has keys, `KEYS`.
+LINEAR = {
+    "both": lambda q, k, v: q.softmax(-1) @ (k.softmax(-2).mT @ v),
+    "queries": lambda q, k, v: q.softmax(-1) @ (nn.functional.elu(k).mT @ v),
+    "scaled": lambda q, k, v: q.softmax(-1) @ (k.softmax(-2).mT @ v / 3).contiguous(),
+}
+
+
+@pytest.mark.parametrize("multiply", LINEAR.values(), ids=LINEAR)
+@pytest.mark.parametrize("cut", [None, "role:state"])
+def test_linear_attention_has_no_rows(tmp_path, multiply, cut):
+    def attend(block, q, k, v):
+        return multiply(*(torch.cat([given, given, given[..., :1]], dim=-1) for given in (q, k)), v)
+
+    policy = OddPolicy(attend)
+    with pytest.raises(RowsRefused if cut is None else ChangeRefused):
+        rows_of(tmp_path, policy, cut=cut)
+
+
+def test_linear_attention_by_a_softmax_over_keys_has_no_rows(tmp_path):
+    """The first product looks like attention of as many queries as channels; the second sums over these."""
+
+    def attend(block, q, k, v):
+        context = torch.einsum("bhdn,bhen->bhde", k.mT.contiguous().softmax(-1), v.mT)
+        return torch.einsum("bhde,bhdn->bhne", context, q.mT)
+
+    policy = OddPolicy(attend)
+    with pytest.raises(RowsRefused):
+        rows_of(tmp_path, policy)
+    table = inspect(policy, policy.act)
+    assert all(row.refused for row in table.rows)
+
+
+BETWEEN = {
+    "linear": lambda z, other: nn.functional.linear(z, torch.eye(KEYS)),
+    "convolution": lambda z, other: nn.functional.conv1d(z.flatten(0, 1), torch.ones(ACTIONS, ACTIONS, 1)).view_as(z),
+    "baddbmm": lambda z, other: torch.baddbmm(z[0], other[0], torch.eye(KEYS).expand(HEADS, -1, -1))[None],
+    "sum": lambda z, other: z + other,
+    "in place": lambda z, other: other.clone().add_(z),
+}
+
+
+@pytest.mark.parametrize("between", BETWEEN.values(), ids=BETWEEN)
+def test_a_softmax_of_features_is_followed_to_no_product_of_others(tmp_path, between):
+    """A gate in front of the attention, whose result looks like probabilities again."""
+
+    def attend(block, q, k, v):
+        wide = torch.cat([q, q, q[..., :1]], dim=-1)  # KEYS channels
+        made = between(torch.softmax(wide, dim=-1), wide)
+        return by_hand(block, q, k, v) + 0 * (made @ v)
+
+    policy = OddPolicy(attend)
+    rows, result = rows_of(tmp_path, policy, contributions=False)
+    assert torch.equal(result, policy.act())
+    np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("low", [-30.0, -90.0, -100.0, -1000.0])
+@pytest.mark.parametrize("how", ["hand", "sdpa", "hand, causal"])
+def test_masks_of_every_depth(tmp_path, dtype, low, how):
+    """A key that is far below is masked: its role and the baseline say so; one that is a little below is read."""
+    mask = torch.zeros(ACTIONS, KEYS)
+    mask[: 2 if "causal" in how else None, 2] = low
+
+    def attend(block, q, k, v):
+        if how == "sdpa":
+            return nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask.to(dtype))
+        return torch.softmax(logits(q, k) + mask.to(dtype), dim=-1) @ v
+
+    rows_of(tmp_path, OddPolicy(attend).to(dtype))
+    episode = open_store(tmp_path / "a.zarr").episodes[0]
+    hidden = (mask < -50).numpy()
+    image, masked = Role.IMAGE, Role.MASKED_IMAGE
+    assert episode.read("joint/key_role")[0, 2] == (masked if hidden[:, 2].all() else image)
+    uniform = np.where(hidden, 0, 1 / (KEYS - hidden.sum(-1, keepdims=True)))
+    stored = np.broadcast_to(episode.read("joint/uniform")[0, 0, 0, 0], uniform.shape)
+    np.testing.assert_allclose(stored, uniform, rtol=1e-6)
+
+
+def test_a_knockout_leaves_no_query_with_masked_keys_alone(tmp_path):
+    def attend(block, q, k, v):
+        return torch.softmax(logits(q, k) - 100.0 * (torch.arange(KEYS) == 2), dim=-1) @ v
+
+    with pytest.raises(QueryWithoutKeys):
+        rows_of(tmp_path, OddPolicy(attend), cut="* - patch:front[1:2,0:1]")
 
 
 SPELLINGS = {

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from tests.kit.attention_modules import Policy, Seen, reference_rows
 from tests.kit.examples import examples
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.watch import watch_attention
 
 
@@ -190,6 +191,31 @@ def test_a_change_takes_keys_away(attend):
     torch.testing.assert_close(second.rows[1], left / left.sum(-1, keepdim=True), rtol=1e-5, atol=1e-6)
     assert max(second.errors) < 5e-6
     assert torch.equal(first.allowed[1], second.allowed[1])
+
+
+@pytest.mark.parametrize("attend", SPELLINGS, ids=lambda function: function.__name__)
+@given(data=st.data())
+@settings(max_examples=examples(8))
+def test_a_change_hits_its_cells_or_is_refused(attend, data):
+    """Whatever the order of the axes: cut cells are 0, the others the unchanged softmax without them."""
+    batch, heads, queries = data.draw(st.tuples(st.integers(1, 2), st.sampled_from([2, 4]), st.sampled_from([2, 3, 4])))
+    torch.manual_seed(data.draw(st.integers(0, 999)))
+    sizes = data.draw(st.sampled_from([(heads, queries, 6), (heads, 1, 6), (1, queries, 6), (6,)]))
+    change = torch.zeros(sizes).masked_fill(torch.rand(sizes) < 0.3, -math.inf)
+    change[..., 0] = data.draw(st.sampled_from([0.0, math.log(0.3)]))
+    policy = Policy(attend, heads=heads, kv_heads=heads // 2).eval().requires_grad_(False)
+    hidden, memory = (torch.randn(batch, count, policy.head.in_features) for count in (queries, 6))
+    plain_call, seen = Seen(), Seen(changes=lambda shape: change if shape.module == "layers.0" else None)
+    with watch_attention(policy, plain_call):
+        policy(hidden, memory)
+    try:
+        with watch_attention(policy, seen):
+            policy(hidden, memory)
+    except ChangeRefused:
+        assert attend in (queries_before_heads, altered_in_place)
+        return
+    wanted = plain_call.rows[0] * change.exp()
+    torch.testing.assert_close(seen.rows[0], wanted / wanted.sum(-1, keepdim=True), rtol=1e-4, atol=2e-6)
 
 
 @pytest.mark.parametrize("attend", [plain, grouped, transposed, queries_before_heads])
