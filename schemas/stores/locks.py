@@ -33,7 +33,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 from vla_attention.schemas.jsonable import MalformedDocument, decode_json, from_json, to_json
-from vla_attention.schemas.stores.store_format import StoreError, StoreExists, is_episode_name
+from vla_attention.schemas.stores.store_format import StoreExists, StoreNotFound, is_episode_name
 from vla_attention.schemas.stores.worker import Worker, is_known_dead, this_worker
 
 #: Of unfinished episodes and their locks, in a store. Without a `zarr.json`: it is no part of the store.
@@ -114,7 +114,7 @@ class Locks:
         """Lock a name. Returns None after success, else who holds it.
 
         Raises:
-            StoreError: the store has been removed.
+            StoreNotFound: the store was moved or deleted.
             OSError: the folder cannot be written to.
         """
         lock, holder = self._lock(name), None
@@ -255,7 +255,7 @@ class Locks:
     def _make_place(self) -> None:
         """Make the folder of the locks, which whoever finds it empty removes."""
         if not self.folder.parent.is_dir():
-            raise StoreError(f"The folder {self.folder.parent} has been removed.")
+            raise StoreNotFound(f"The folder {self.folder.parent} was moved or deleted.")
         self.folder.mkdir(exist_ok=True)
 
     def _judge(self, name: str, seen: _Seen, now: Callable[[], float]) -> Holder:
