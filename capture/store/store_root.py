@@ -60,6 +60,9 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
                     publish(building, path, durable)
         except Held:  # by another process of the same array job
             time.sleep(_LOOK_EVERY_S)
+        except OSError:
+            if not path.exists():  # else another process made it, which took this one for dead
+                raise
     return read_existing_root(path)
 
 

@@ -244,6 +244,19 @@ def test_many_processes_create_and_fill_one_store(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_process_that_finds_the_store_made_by_another_goes_on_with_it(tmp_path, uninterrupted):
+    path = tmp_path / "a.zarr"
+
+    def made_by_another() -> None:
+        write_store(tmp_path / "other.zarr", spec=SPEC).rename(path)
+
+    with before_call("rename", 0, made_by_another):
+        store = open_run(path, root_attributes(SPEC), "new")
+    assert len(store.committed()) == 2
+    assert store_bytes(path) == uninterrupted
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, uninterrupted):
     path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, seed=5))
 
