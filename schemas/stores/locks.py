@@ -149,7 +149,7 @@ class Locks:
         with self._mutex:
             self._held.discard(name)
         if self.holds(name):
-            self._lock(name).unlink(missing_ok=True)
+            _remove(self._lock(name))  # where that is refused, others take it once this process has ended
         _remove_if_empty(self.folder)
 
     def holds(self, name: str) -> bool:
@@ -250,7 +250,7 @@ class Locks:
             try:
                 os.write(handle, self._content)
             except OSError:
-                file.unlink(missing_ok=True)
+                _remove(file)
                 raise
             finally:
                 os.close(handle)
@@ -292,7 +292,7 @@ class Locks:
         except FileNotFoundError:  # another process has swept the folder
             return time.time()
         finally:
-            probe.unlink(missing_ok=True)
+            _remove(probe)
 
     def _remove_dead(self, lock: Path, seen: _Seen) -> None:
         """Remove a dead holder's lock, unless another process does it or has done it."""
@@ -300,13 +300,13 @@ class Locks:
         if not self._create(guard):
             taking = _look(guard)
             if taking is not None and self._judge(guard, taking, self._now).is_dead:
-                guard.unlink(missing_ok=True)
+                _remove(guard)
             return
         try:
             if _look(lock) == seen:  # neither touched nor replaced since it was judged
                 _remove(lock)
         finally:
-            guard.unlink(missing_ok=True)
+            _remove(guard)
 
     def _remove_parts(self, name: str) -> None:
         """Remove what earlier holders wrote of a name that is locked now."""

@@ -235,6 +235,21 @@ def test_of_two_that_found_the_same_dead_holder_one_replaces_it(store, monkeypat
     assert first.holds(NAME)
 
 
+def test_a_lock_that_may_not_be_deleted_is_no_error_of_its_holder(store, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    first, second = episode_locks(store, worker(1)), episode_locks(store, worker(2))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", refuse)
+        patch.setattr(Path, "unlink", refuse)
+        with first.part(NAME) as folder:
+            assert second.acquire(NAME) is not None
+        assert not folder.exists()
+    age(store, 301)
+    assert second.acquire(NAME) is None
+
+
 def test_a_living_holder_touches_its_lock(store):
     with episode_locks(store, worker(1)) as first:
         first.touch_every_s = 0.05
