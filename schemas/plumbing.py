@@ -1,4 +1,4 @@
-"""Whether an instruction gets through to the model: what one extra call at the beginning of a run showed."""
+"""Whether an instruction gets through to the model: what one extra call at the beginning of an episode showed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vla_attention.schemas.safe_text import visible
 
 
 class Plumbing(Document, frozen=True):
-    """What was seen at the first policy call of a process, which was made again with a wholly different instruction.
+    """What was seen at the first policy call of an episode, which was made again with a wholly different instruction.
 
     Only the first two are plumbing: a tokenizer, the key of a data set, a batch. A model may get every word and pay no
     attention to it.

@@ -7,7 +7,6 @@ whole. The given stores are only read.
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -36,8 +35,6 @@ from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, StorePlace, Sto
 
 #: Differing fields that are named of two stores.
 _MOST_NAMED = 5
-#: What a file system says that has no hard links, or none here.
-_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP)
 
 
 @dataclass(frozen=True)
@@ -171,10 +168,8 @@ def _linked(episode: StoredEpisode, file: str, place: Path) -> bool:
     path = episode.folder / file
     try:
         os.link(path, place, follow_symlinks=False)
-    except OSError as error:
-        if error.errno in _NO_LINKS:
-            return False
-        if isinstance(error, (FileNotFoundError, NotADirectoryError)):
-            raise CorruptEpisode(f"Episode {episode.name} has lost its {file} ({error.strerror}).") from None
-        raise
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise CorruptEpisode(f"Episode {episode.name} has lost its {file} ({error.strerror}).") from None
+    except OSError:  # file systems without links say it in many ways; what else is wrong, copying says
+        return False
     return True

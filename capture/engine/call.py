@@ -63,8 +63,8 @@ class Caller:
     """Makes the policy calls of a run.
 
     recording: what is recorded of them. changes: the run's interventions; without any, nothing. effects: what measures
-    the effects of calls; None where they are not recorded. looks_at_words: whether the first calls are looked at for
-    whether the instruction gets through (`plumbing.py`); a rerun repeats calls that were.
+    the effects of calls; None where they are not recorded. looks_at_words: whether it is looked at whether
+    the instruction gets through (`plumbing.py`); a rerun repeats calls that were.
     """
 
     policy: Policy
@@ -158,7 +158,7 @@ def record_of(
     """Return what is stored of a call that was made, with its effects.
 
     rows, actions: what it gave. effects: what measures its effects, None for none. noise_seed: the stored one.
-    plumbing: of the first call of a process.
+    plumbing: where it was looked at whether the instruction gets through.
     """
     given = call.policy_input
     measured = None

@@ -96,11 +96,14 @@ class EpisodeLoop:
     #: Those of them that have a policy call, in the order in which it came.
     _ready: deque[_Running] = field(default_factory=deque, init=False)
     _committing: list[_Running] = field(default_factory=list, init=False)
-    #: Whether it was looked at whether the instruction gets through.
-    _looked: bool = field(default=False, init=False)
+    #: What was said of instructions that do not get through.
+    _said_of_words: set[str] = field(default_factory=set, init=False)
 
     def __post_init__(self) -> None:
         """Begin the log of this worker."""
+        #: The first planned episode of each task: at its first call it is looked at whether the instruction gets
+        #: through, so that an episode is the same whichever process recorded it, and however often it was begun.
+        self._of_words = {(task.task_id, task.indices[0]) for task in self.plan if task.indices}
         self.log = WorkerLog(self.store.path, self.store.locks.worker, self.plan)
 
     def record_all(self, missing: Sequence[EpisodeJob]) -> list[Committed]:
@@ -267,30 +270,34 @@ class EpisodeLoop:
         batch = [self._ready.popleft() for _ in range(min(self.policy_batch, len(self._ready)))]
         calls = [running.call for running in batch if running.call is not None]
         made = caller.make(calls)
-        plumbing = self._look_at_words(caller, calls, made)
-        recorded: list[tuple[_Running, PolicyCall, RecordedCall]] = []
-        for running, call, result in zip(batch, calls, made, strict=True):
+        looked = [self._look_at_words(caller, running, calls, made, row) for row, running in enumerate(batch)]
+        recorded: list[tuple[_Running, PolicyCall, RecordedCall, Plumbing | None]] = []
+        for running, call, result, plumbing in zip(batch, calls, made, looked, strict=True):
             running.call = None
             with self._dropping_faults(running):
                 if isinstance(result, NumbersNotFinite):
                     raise result
                 assert running.episode is not None
                 running.episode.advance(result.actions)
-                recorded.append((running, call, result))
-        for running, call, result in recorded:
-            self._keep(caller, running, call, result, plumbing)
-            plumbing = None
+                recorded.append((running, call, result, plumbing))
+        for each in recorded:
+            self._keep(caller, *each)
 
     def _look_at_words(
-        self, caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall | NumbersNotFinite]
+        self,
+        caller: Caller,
+        running: _Running,
+        calls: Sequence[PolicyCall],
+        made: Sequence[RecordedCall | NumbersNotFinite],
+        row: int,
     ) -> Plumbing | None:
-        """Return whether the instruction gets through, of the first calls of the process; None of later ones."""
-        results = [one for one in made if isinstance(one, RecordedCall)]
-        if not caller.looks_at_words or self._looked or len(results) < len(made):
+        """Return whether the instruction gets through, of the call that is in this row; None where it is not asked."""
+        of = (running.job.task.task_id, running.job.episode_index)
+        if not caller.looks_at_words or of not in self._of_words or running.num_replans:
             return None
-        self._looked = True
-        found = look_at_words(caller, calls, results)
-        if said := found.problem:
+        found = look_at_words(caller, calls, made, row)
+        if found is not None and (said := found.problem) and said not in self._said_of_words:
+            self._said_of_words.add(said)
             self.progress.say(f"WARNING: {said}")
         return found
 

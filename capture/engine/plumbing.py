@@ -1,4 +1,4 @@
-"""Does the instruction get through to the model? Looked at once, at the first policy calls of a process."""
+"""Does the instruction get through to the model? Looked at in one episode of each task, at its first policy call."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from msgspec import structs
 from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall
 from vla_attention.capture.policies.policy import PolicyInput, UnitsPolicy
 from vla_attention.capture.policies.random_numbers import RandomNumbers
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.layout import Prompt
@@ -21,15 +22,21 @@ from vla_attention.schemas.plumbing import Plumbing
 WHOLLY_DIFFERENT = "wave hello twice"
 
 
-def look_at_words(caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall]) -> Plumbing:
-    """Make the first call once more with a wholly different instruction, and hold a batch's rows against single calls.
+def look_at_words(
+    caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall | NumbersNotFinite], row: int
+) -> Plumbing | None:
+    """Make a call of a batch once more with a wholly different instruction, and hold the rows against single calls.
 
-    Nothing of it is recorded, and the random numbers are as before: the run's actions are the same to the bit.
+    None where the call gave no numbers. Nothing of it is recorded, and the random numbers are as before: the run's
+    actions are the same to the bit.
     """
+    first = made[row]
+    if not isinstance(first, RecordedCall):
+        return None
     before = RandomNumbers()
     counted = caller.changes.num_replans, caller.changes.num_empty
     try:
-        return structs.replace(_changed(caller, calls[0], made[0]), row_of_another=_row_of_another(caller, calls, made))
+        return structs.replace(_changed(caller, calls[row], first), row_of_another=_row_of_another(caller, calls, made))
     finally:
         before.again()
         caller.changes.num_replans, caller.changes.num_empty = counted
@@ -92,17 +99,21 @@ def _is_another(one: PolicyInput, other: PolicyInput) -> bool:
     )
 
 
-def _row_of_another(caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall]) -> bool | None:
+def _row_of_another(
+    caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall | NumbersNotFinite]
+) -> bool | None:
     """Whether the first row that has another instruction than row 0 was answered as if it had row 0's."""
     first = calls[0].policy_input.prompt.instruction_text
     place = next((i for i, one in enumerate(calls) if one.policy_input.prompt.instruction_text != first), None)
     if place is None:
         return None
-    call = calls[place]
+    call, answered = calls[place], made[place]
+    if not isinstance(answered, RecordedCall):
+        return None
     mixed = caller.policy.prepare_again(replace(call.policy_input.given, instruction=first))
     try:
         ways = [caller.make([one])[0] for one in (call, replace(call, policy_input=mixed))]
     except UserError:  # as in `_changed`
         return None
-    away = [np.abs(way.actions - made[place].actions).max() for way in ways if isinstance(way, RecordedCall)]
+    away = [np.abs(way.actions - answered.actions).max() for way in ways if isinstance(way, RecordedCall)]
     return None if len(away) < len(ways) or away[0] == away[1] else bool(away[1] < away[0])

@@ -12,10 +12,12 @@ import atexit
 import contextlib
 import gc
 import os
+import select
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing import Pipe
@@ -47,6 +49,8 @@ _DRAWS_ITSELF = {"LP_NUM_THREADS": "0"}
 _NICENESS = 5
 #: Seconds that a process gets to end by itself.
 _END_WITHIN_S = 2.0
+#: Milliseconds between two looks whether the policy's process lives.
+_LOOK_EVERY_MS = 1000
 #: The paths of modules are those of the first process, which may have got some while it ran.
 _BOOT = (
     "import sys; sys.path[:] = sys.argv[3:]; "
@@ -279,6 +283,17 @@ class _ProcessServer(SimulatorServer):
         return environment
 
 
+def _end_with_the_policy(descriptor: int, temporary: str) -> None:
+    """End this process with the policy's, also in the middle of a reset, which takes minutes where a disk is slow."""
+    policy, other_end = os.getppid(), select.poll()
+    other_end.register(descriptor, 0)  # its closing is told in any case
+    # What the policy's process forked may hold the other end after it.
+    while not other_end.poll(_LOOK_EVERY_MS) and os.getppid() == policy:
+        pass
+    shutil.rmtree(temporary, ignore_errors=True)
+    os._exit(0)
+
+
 def main(descriptor: int, temporary: str | None = None) -> None:
     """Simulate for the process at the other end of a connection, until that end closes.
 
@@ -287,6 +302,7 @@ def main(descriptor: int, temporary: str | None = None) -> None:
     if temporary is not None:
         # What is registered first is called last: others remove their files in it before.
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        threading.Thread(target=_end_with_the_policy, args=(descriptor, temporary), daemon=True).start()
     connection = Connection(descriptor)
     os.nice(_NICENESS)
     try:

@@ -17,6 +17,7 @@ from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
+from vla_attention.capture.store.unpublished import UnpublishedFolder
 from vla_attention.schemas.effects import EpisodeEffects
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import to_json
@@ -48,6 +49,7 @@ from vla_attention.schemas.stores.store_format import (
     RootAttributes,
     StoreError,
     StoreExists,
+    StoreNotFound,
     episode_name,
 )
 from vla_attention.schemas.stores.store_place import why_refused
@@ -65,10 +67,19 @@ def naming_the_failure(what: str, place: Path) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, UserError):
             raise
+        _check_exists(place)
         raise StoreWriteFailed(
             f"Cannot write {what}: {why_refused(error, place)}. Nothing of this episode was kept, and the episodes "
             "before it are unharmed; remove the cause and go on with --resume."
         ) from error
+
+
+def _check_exists(store: Path) -> None:
+    if not store.exists():
+        raise StoreNotFound(
+            f"The store {store} was moved or deleted while an episode was written, of which nothing was kept. "
+            "Put it back and go on with --resume, or begin a new one."
+        )
 
 
 #: What an episode's provenance calls the cameras whose picture is of one colour at every replan.
@@ -108,7 +119,7 @@ class EpisodeWriter:
         self.durable = durable
         self.name = episode_name(start.task_id, start.episode_index)
         self.what = f"episode {self.name} of {store}"
-        self.group = zarr.create_group(folder, zarr_format=3)
+        self.group = zarr.create_group(UnpublishedFolder(folder), zarr_format=3)
         self.digests: dict[str, ArrayRecord] = {}
         self.sites = {
             site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site))
@@ -281,8 +292,7 @@ class EpisodeWriter:
 
     def _check_store(self) -> None:
         # Somebody may have removed the store, or replaced it by another run's, while this episode was rolled out.
-        if not self.store.exists():
-            raise StoreError(f"The store {self.store} has been removed.")
+        _check_exists(self.store)
         check_same_run(self.store, read_existing_root(self.store), self.run)
 
     def write(self, name: str, values: NDArray[np.generic], axes: tuple[str, ...]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import zarr
 
+from vla_attention.capture.store.unpublished import UnpublishedFolder
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
@@ -53,12 +54,15 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
         try:
             with locks.part(WHOLE_STORE) as building:
                 if not path.exists():
-                    root = zarr.create_group(building, zarr_format=3)
+                    root = zarr.create_group(UnpublishedFolder(building), zarr_format=3)
                     root.update_attributes(with_digest(to_json(attributes)))
                     root.create_group(EPISODES_GROUP)
                     publish(building, path, durable)
         except Held:  # by another process of the same array job
             time.sleep(_LOOK_EVERY_S)
+        except OSError:
+            if not path.exists():  # else another process made it, which took this one for dead
+                raise
     return read_existing_root(path)
 
 

@@ -176,11 +176,13 @@ class WatchedCall(ReplanRecorder):
         return record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed, plumbing)
 
     def _look_at_words(self, one: RowOfCall, prompt: Prompt, actions: NDArray[np.float64] | None) -> Plumbing | None:
-        """Return whether the instruction gets through, of the first call of the run; None of later ones."""
+        """Return whether the instruction gets through, of the first call of a new store; None of later ones."""
         run, inputs = self._run, one.inputs
         if run._looked_at_words:
             return None
         run._looked_at_words = True
+        if run.store.committed():  # of a run that is resumed, whose first episode has it
+            return None
         found = look_at_words_heard(
             prompt, inputs.instruction, actions, inputs.repeat, self._before_first, run._embeddings
         )

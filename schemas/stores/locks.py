@@ -9,7 +9,9 @@ error (`durable_files.publish`). A lock keeps the second writer from starting.
 
 A lock is a file that is made with `O_EXCL`, which one of several processes can do, on local file systems as on NFS and
 Lustre. Its holder touches it every half minute. A holder counts as dead if its end is certain (`is_known_dead`), or if
-the lock was not touched for five minutes by the clock of the file server. Whoever replaces a dead holder holds
+the lock was not touched for five minutes: by the clock of the file server, or, since its holder's clock may be ahead of
+that, as long as the waiter has looked at it. An empty lock, whose holder was killed before it wrote into it, counts for
+ten seconds. Whoever replaces a dead holder holds
 `EPISODE.taking` meanwhile, which is made in the same way: without it, one of two that found the same dead holder would
 delete the new lock of the other. What the dead holder wrote is renamed before it is removed: its rename of the whole
 episode, should it still come, then fails or came first.
@@ -33,7 +35,7 @@ from types import TracebackType
 from typing import NamedTuple
 
 from vla_attention.schemas.jsonable import MalformedDocument, decode_json, from_json, to_json
-from vla_attention.schemas.stores.store_format import StoreError, StoreExists, is_episode_name
+from vla_attention.schemas.stores.store_format import StoreExists, StoreNotFound, is_episode_name
 from vla_attention.schemas.stores.worker import Worker, is_known_dead, this_worker
 
 #: Of unfinished episodes and their locks, in a store. Without a `zarr.json`: it is no part of the store.
@@ -46,6 +48,8 @@ WHOLE_STORE = "store"
 TOUCH_EVERY_S = 30.0
 #: Seconds without a touch after which a holder counts as dead: ten missed touches.
 DEAD_AFTER_S = 300.0
+#: Seconds after which an empty lock counts as left behind: its holder writes into it as soon as it is made.
+WRITTEN_WITHIN_S = 10.0
 _LOCK, _TAKING, _ASIDE = ".lock", ".taking", "removed-"
 _ATTEMPTS = 5
 _UNKNOWN = Worker("", "an unknown machine", 0, "", "")
@@ -71,10 +75,11 @@ class Holder:
 class Held(StoreExists):
     """Another process is writing the same."""
 
-    def __init__(self, place: Path, holder: Holder) -> None:
+    def __init__(self, place: Path, holder: Holder, lock: Path) -> None:
         super().__init__(
             f"Another process is writing {place}: {holder.worker.describe()}, last active {holder.silent_s:.0f} s ago. "
-            f"Wait for it, or give another place. If it has ended, try again after {DEAD_AFTER_S / 60:.0f} minutes."
+            f"Wait for it, or give another place. If it has ended, delete {lock}, or try again after "
+            f"{DEAD_AFTER_S / 60:.0f} minutes."
         )
         self.holder = holder
 
@@ -102,6 +107,8 @@ class Locks:
         self._mutex = threading.Lock()
         self._held: set[str] = set()
         self._toucher: threading.Thread | None = None
+        #: Of every lock of others: what was seen, and when it was seen first (monotonic).
+        self._first_seen: dict[Path, tuple[_Seen, float]] = {}
 
     def __enter__(self) -> Locks:
         return self
@@ -114,7 +121,7 @@ class Locks:
         """Lock a name. Returns None after success, else who holds it.
 
         Raises:
-            StoreError: the store has been removed.
+            StoreNotFound: the store was moved or deleted.
             OSError: the folder cannot be written to.
         """
         lock, holder = self._lock(name), None
@@ -130,7 +137,7 @@ class Locks:
             if seen.content == self._content:
                 self._hold(name)
                 return None
-            holder = self._judge(name, seen, self._now)
+            holder = self._judge(lock, seen, self._now)
             if not holder.is_dead:
                 return holder
             self._remove_dead(lock, seen)
@@ -142,12 +149,15 @@ class Locks:
         with self._mutex:
             self._held.discard(name)
         if self.holds(name):
-            self._lock(name).unlink(missing_ok=True)
+            _remove(self._lock(name))  # where that is refused, others take it once this process has ended
         _remove_if_empty(self.folder)
 
     def holds(self, name: str) -> bool:
         """Whether the lock is this process's own, also after it stood still."""
-        seen = _look(self._lock(name))
+        return self._is_own(self._lock(name))
+
+    def _is_own(self, file: Path) -> bool:
+        seen = _look(file)
         return seen is not None and seen.content == self._content
 
     @contextmanager
@@ -162,7 +172,7 @@ class Locks:
         with self._mutex:
             held = name in self._held
         if not held and (holder := self.acquire(name)) is not None:
-            raise Held(self.owner if name == WHOLE_STORE else self.owner / name, holder)
+            raise Held(self.owner if name == WHOLE_STORE else self.owner / name, holder, self._lock(name))
         folder = self.folder / f"{name}-{uuid.uuid4().hex[:12]}"
         try:
             self._make(folder)
@@ -201,8 +211,9 @@ class Locks:
 
     def holders(self) -> list[Holder]:
         """The holders of all locks, dead or alive, by this machine's clock."""
-        looked = [(path.name.removesuffix(_LOCK), _look(path)) for path in self._entries() if path.name.endswith(_LOCK)]
-        return [self._judge(name, seen, time.time) for name, seen in looked if seen is not None and self._is_name(name)]
+        locks = [path for path in self._entries() if path.suffix == _LOCK and self._is_name(path.stem)]
+        looked = [(path, _look(path)) for path in locks]
+        return [self._judge(path, seen, time.time) for path, seen in looked if seen is not None]
 
     def _lock(self, name: str) -> Path:
         return self.folder / f"{name}{_LOCK}"
@@ -227,7 +238,7 @@ class Locks:
         return sorted({name for path in self._entries() if (name := self._name_of(path)) is not None})
 
     def _create(self, file: Path) -> bool:
-        """Make a file with this process in it; False if it exists."""
+        """Make a file with this process in it; False if it exists, or another process took it before it was written."""
         while True:
             try:
                 handle = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
@@ -239,11 +250,11 @@ class Locks:
             try:
                 os.write(handle, self._content)
             except OSError:
-                file.unlink(missing_ok=True)
+                _remove(file)
                 raise
             finally:
                 os.close(handle)
-            return True
+            return self._is_own(file)
 
     def _make(self, folder: Path) -> None:
         while True:
@@ -255,14 +266,22 @@ class Locks:
     def _make_place(self) -> None:
         """Make the folder of the locks, which whoever finds it empty removes."""
         if not self.folder.parent.is_dir():
-            raise StoreError(f"The folder {self.folder.parent} has been removed.")
-        self.folder.mkdir(exist_ok=True)
+            raise StoreNotFound(f"The folder {self.folder.parent} was moved or deleted.")
+        try:
+            self.folder.mkdir()
+        except FileExistsError:  # made meanwhile, and perhaps removed again
+            if self.folder.is_symlink():
+                raise
 
-    def _judge(self, name: str, seen: _Seen, now: Callable[[], float]) -> Holder:
-        # A lock may be empty: its holder was killed before it wrote into it. Nobody touches it.
+    def _judge(self, file: Path, seen: _Seen, now: Callable[[], float]) -> Holder:
+        before, first = self._first_seen.get(file, (None, 0.0))
+        if before != seen:
+            first = time.monotonic()
+            self._first_seen[file] = seen, first
         worker = _worker(seen.content) or _UNKNOWN
-        silent = max(0.0, now() - seen.touched_s)
-        return Holder(name, worker, silent, silent >= self.dead_after_s or is_known_dead(worker, self.worker))
+        silent = max(0.0, now() - seen.touched_s, time.monotonic() - first)
+        too_long = silent >= (self.dead_after_s if seen.content else WRITTEN_WITHIN_S)
+        return Holder(file.stem, worker, silent, too_long or is_known_dead(worker, self.worker))
 
     def _now(self) -> float:
         """The time of the file server: that of a file that was made just now."""
@@ -273,21 +292,21 @@ class Locks:
         except FileNotFoundError:  # another process has swept the folder
             return time.time()
         finally:
-            probe.unlink(missing_ok=True)
+            _remove(probe)
 
     def _remove_dead(self, lock: Path, seen: _Seen) -> None:
         """Remove a dead holder's lock, unless another process does it or has done it."""
         guard = lock.with_suffix(_TAKING)
         if not self._create(guard):
             taking = _look(guard)
-            if taking is not None and self._judge(lock.stem, taking, self._now).is_dead:
-                guard.unlink(missing_ok=True)
+            if taking is not None and self._judge(guard, taking, self._now).is_dead:
+                _remove(guard)
             return
         try:
             if _look(lock) == seen:  # neither touched nor replaced since it was judged
                 _remove(lock)
         finally:
-            guard.unlink(missing_ok=True)
+            _remove(guard)
 
     def _remove_parts(self, name: str) -> None:
         """Remove what earlier holders wrote of a name that is locked now."""

@@ -349,8 +349,8 @@ class EpisodeAttributes(Document, frozen=True):
     `task_family`: what tasks of one sentence template share; empty where nobody knows it. `effects`: what the arrays of
     effects are of; None where none were measured. `steps`: the same of the arrays of steps; None where no simulator of
     ours ran the episode. `scene_task_id`: the task whose scene and initial state an exchanged episode began with; None
-    for an episode that began with its own. `plumbing`: where the first policy call of a process is this
-    episode's.
+    for an episode that began with its own. `plumbing`: of the first planned episode of each
+    task, or of the first one of a new store.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from zarr.storage import LocalStore
+from vla_attention.capture.store.unpublished import UnpublishedFolder
 
 #: Processes that have imported everything and started no thread yet, so that a child is there at once.
 PROCESSES = multiprocessing.get_context("forkserver")
@@ -23,7 +23,7 @@ def before_call(kind: str, number: int, action: Callable[[], None]):
 
     "renamed" and "replaced": after one.
     """
-    owner: Any = {"set": LocalStore, "fsync": os}.get(kind, Path)
+    owner: Any = {"set": UnpublishedFolder, "fsync": os}.get(kind, Path)
     name = kind.removesuffix("d")
     original = getattr(owner, name)
     calls = 0

@@ -80,9 +80,10 @@ def test_the_merged_store_is_the_one_that_one_capture_writes(original, parts, tm
     assert_whole(tmp_path / "c.zarr")
 
 
-def test_files_are_copied_where_there_are_no_hard_links(original, parts, tmp_path, monkeypatch):
+@pytest.mark.parametrize("code", [errno.EXDEV, errno.EPERM, errno.ENOSYS])
+def test_files_are_copied_where_there_are_no_hard_links(original, parts, tmp_path, monkeypatch, code):
     def no_links(*_: object, **__: object) -> None:
-        raise OSError(errno.EXDEV, "Invalid cross-device link")
+        raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "link", no_links)
     merged = merge_stores([open_store(part) for part in parts], tmp_path / "c.zarr")

@@ -41,7 +41,8 @@ def looked(policy: Any, *told: str, changes: Interventions = UNCHANGED) -> Plumb
     ]
     caller = Caller(policy, RECORDING, RunChanges(changes, dict(enumerate(TOLD))))
     before, made = torch.get_rng_state(), caller.make(calls)
-    found = look_at_words(caller, calls, made)
+    found = look_at_words(caller, calls, made, 0)
+    assert found is not None
     assert torch.equal(before, torch.get_rng_state())
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import pytest
 import zarr
 
 from tests.capture.engine.simulators_in_threads import TINY, ThreadOfTests, assert_same_episodes, record
+from tests.kit.races import unlike
 from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
@@ -168,7 +170,7 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
     assert record(tmp_path / "four.zarr", 4, "--policy-batch", "3", *words) == 0
     assert re.search("at most 3; --policy-batch", capsys.readouterr().out)
     assert sizes[0] == 3
-    assert sum(sizes) == 8 + 3  # three single calls look at whether the words get through
+    assert sum(sizes) == 8 + 2 * 3  # for each task, three single calls look at whether the words get through
     given = {kind: open_store(tmp_path / f"{kind}.zarr").episodes[0].attributes.provenance for kind in ("one", "four")}
     assert "policy_batch" not in given["one"]
     assert given["four"] == {**given["one"], "policy_batch": "3"}
@@ -184,6 +186,71 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
         for name in ("noise_seed", "env_step"):
             assert four.attrs[name] == one.attrs[name]
     assert analyze(["store", "verify", str(tmp_path / "four.zarr")]) == 0
+
+
+def test_a_resumed_store_has_the_bytes_of_an_undisturbed_one(scene, tmp_path):
+    """Whichever episodes were there, and whichever process recorded them."""
+    words = ["--task-id", "0", "2", "--num-episodes", "2"]
+    whole, store = tmp_path / "whole/a.zarr", tmp_path / "a.zarr"
+    assert record(whole, 1, *words) == 0
+    episodes = sorted((whole / "episodes").glob("task*"))
+    for missing in (episodes[:1], episodes[1:], [episodes[0], episodes[2]]):
+        shutil.copytree(whole, store)
+        for episode in missing:
+            shutil.rmtree(store / "episodes" / episode.name)
+        assert record(store, 2, "--resume", *words) == 0
+        assert unlike(store, whole) == ()
+        shutil.rmtree(store)
+    assert record(store, 1, "--task-id", "2", "--num-episodes", "2") == 0
+    assert record(store, 1, "--resume", *words) == 0
+    assert unlike(store, whole) == ()
+
+
+class Hangs:
+    """The setup of a simulator that answers once, with its number, and then does something else for ever."""
+
+    title = "a reset"
+
+    def server(self, connection: Any) -> Hangs:
+        connection.send(os.getpid())
+        return self
+
+    def serve(self) -> None:
+        while True:
+            time.sleep(60)
+
+
+#: Starts such a simulator and is killed; a fork of it may hold the other end of the connection.
+_KILLED = """
+import os, signal, sys, time
+from tests.capture.engine.test_simulators import Hangs
+from vla_attention.capture.engine.simulator_process import SimulatorProcess
+simulator = SimulatorProcess(Hangs())
+number, fork = simulator.receive(), "held" in sys.argv and os.fork()
+if fork == 0 and "held" in sys.argv:
+    time.sleep(600)
+print(number, int(fork), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("held", [False, True], ids=["alone", "a fork goes on"])
+def test_a_simulator_ends_with_the_policys_process_whatever_it_does(tmp_path, held):
+    command = [sys.executable, "-c", _KILLED, *["held"] * held]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ | {"TMPDIR": str(tmp_path)}) as policy:
+        assert policy.stdout is not None
+        number, fork = map(int, policy.stdout.readline().split())
+    until = time.monotonic() + 60
+    try:
+        while _is_simulator(number):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+    finally:
+        if fork:
+            os.kill(fork, signal.SIGKILL)
+        if _is_simulator(number):
+            os.kill(number, signal.SIGKILL)
+    assert list(tmp_path.iterdir()) == []
 
 
 # --------------------------------------------------------------------------------------------- real simulators

@@ -20,7 +20,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from zarr.storage import LocalStore
 
 from tests.kit.crashes import PROCESSES, before_call, die, run_child
 from tests.kit.durable_stores import SPEC, leftovers, names, store_bytes, write_store
@@ -35,6 +34,7 @@ from tests.kit.stores import (
 from tests.kit.thorough import thorough_except
 from vla_attention.capture.store.episode_writer import EpisodeTaken, StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
+from vla_attention.capture.store.unpublished import UnpublishedFolder
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores import worker
 from vla_attention.schemas.stores.locks import Locks
@@ -43,6 +43,7 @@ from vla_attention.schemas.stores.store_format import (
     RunMismatch,
     StoreError,
     StoreExists,
+    StoreNotFound,
     episode_name,
 )
 from vla_attention.schemas.stores.verify import verify_store
@@ -135,9 +136,46 @@ def test_a_disk_that_is_full_when_the_store_is_made(tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
+def test_file_systems_without_hard_links_hold_stores(tmp_path, monkeypatch, uninterrupted):
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "link", refuse)
+    assert store_bytes(write_store(tmp_path / "a.zarr", spec=SPEC)) == uninterrupted
+
+
+@pytest.mark.parametrize("moved", [True, False], ids=["moved", "deleted"])
+def test_a_store_that_goes_away_under_its_writer_does_not_come_back(tmp_path, uninterrupted, moved):
+    path, elsewhere = tmp_path / "a.zarr", tmp_path / "elsewhere"
+    write_store(path, spec=SPEC)
+
+    def go_away() -> None:
+        path.rename(elsewhere)
+        if not moved:
+            shutil.rmtree(elsewhere)
+
+    def write_another() -> None:
+        write_episode(open_run(path, root_attributes(SPEC), "resume"), SPEC, 6, 0)
+
+    with before_call("set", -1, go_away) as calls:
+        write_another()
+    shutil.rmtree(path / "episodes/task006_episode000")
+    for number in (0, 1, calls() // 2, calls() - 1):
+        with before_call("set", number, go_away), pytest.raises(StoreNotFound):
+            write_another()
+        assert not path.exists()
+        assert [*tmp_path.iterdir()] == [elsewhere] * moved
+        if moved:
+            elsewhere.rename(path)
+            shutil.rmtree(path / ".writing")  # its lock is that of this process, which goes on
+        write_store(path, mode="resume", spec=SPEC)
+        assert store_bytes(path) == uninterrupted
+        assert not leftovers(path)
+
+
 def test_bytes_that_come_back_changed_are_never_published(tmp_path, monkeypatch):
     store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
-    original = LocalStore.set
+    original = UnpublishedFolder.set
 
     async def spoiled(self, key, value, **keywords):
         await original(self, key, value, **keywords)
@@ -145,7 +183,7 @@ def test_bytes_that_come_back_changed_are_never_published(tmp_path, monkeypatch)
             file = Path(self.root) / key
             file.write_bytes(file.read_bytes()[:20] + b"\x55" + file.read_bytes()[21:])
 
-    monkeypatch.setattr(LocalStore, "set", spoiled)
+    monkeypatch.setattr(UnpublishedFolder, "set", spoiled)
     with pytest.raises(StoreError, match="joint/atoms"):
         write_episode(store, SPEC, 0, 0)
     assert names(store.path) == []
@@ -203,6 +241,19 @@ def test_many_processes_create_and_fill_one_store(tmp_path):
         assert child.exitcode == 0
     assert names(path) == [episode_name(task, episode) for task in range(4) for episode in range(2)]
     assert verify_store(open_store(path)) == []
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_process_that_finds_the_store_made_by_another_goes_on_with_it(tmp_path, uninterrupted):
+    path = tmp_path / "a.zarr"
+
+    def made_by_another() -> None:
+        write_store(tmp_path / "other.zarr", spec=SPEC).rename(path)
+
+    with before_call("rename", 0, made_by_another):
+        store = open_run(path, root_attributes(SPEC), "new")
+    assert len(store.committed()) == 2
+    assert store_bytes(path) == uninterrupted
     assert list(tmp_path.iterdir()) == [path]
 
 

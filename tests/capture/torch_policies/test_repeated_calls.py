@@ -45,7 +45,7 @@ def repeat_of(policy, replan):
     return again
 
 
-def fill(path, policy, repeat=repeat_of, replans=2, say="default", episodes=1, siblings=SIBLINGS, **settings):
+def fill(path, policy, repeat=repeat_of, replans=2, say="default", episodes=1, first=0, siblings=SIBLINGS, **settings):
     """Record episodes; returns the store, the actions, and what was said."""
     settings = {
         "layout": layout_with_prefix(),
@@ -59,7 +59,7 @@ def fill(path, policy, repeat=repeat_of, replans=2, say="default", episodes=1, s
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         with va.record(path, policy, **settings) as run:
-            for number in range(episodes):
+            for number in range(first, first + episodes):
                 facts = {"task_id": 0, "episode_index": number, "instruction": TEXT, "siblings": siblings}
                 with run.episode(**facts) as episode:
                     for replan in range(replans):
@@ -379,6 +379,8 @@ def test_whether_the_words_get_through(tmp_path, repeat, changed, moved, why):
     assert moved is (None if first.action_changed is None else first.action_changed > 1e-3)
     assert bool(first.why_not) == why
     assert bool(said) == (changed is not True and repeat is not None)
+    resumed, *_ = fill(tmp_path / "a.zarr", policy, repeat, effects=None, resume=True, first=1)
+    assert [episode.attributes.plumbing for episode in resumed.episodes] == [first, None]
     torch.manual_seed(0)
     plain, of_plain, _ = fill(tmp_path / "b.zarr", policy, None, effects=None)
     assert all(torch.equal(mine, its) for mine, its in zip(actions, of_plain, strict=True))

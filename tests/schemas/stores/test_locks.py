@@ -77,6 +77,81 @@ def test_a_silent_holder_is_replaced_and_its_unfinished_episode_removed(store):
     assert third.acquire(NAME) is None
 
 
+class Clocks:
+    """What the module `time` has, with a clock that is set by hand."""
+
+    sleep, time = staticmethod(time.sleep), staticmethod(time.time)
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.mark.parametrize("ahead_s", [-200, 0, 100_000], ids="{} s ahead".format)
+def test_a_lock_whose_clock_is_ahead_is_not_held_for_ever(store, monkeypatch, ahead_s):
+    monkeypatch.setattr(locks, "time", clocks := Clocks())
+    lock = store / ".writing" / f"{NAME}.lock"
+    dead, waiting, another = (episode_locks(store, worker(number)) for number in (1, 2, 3))
+    assert dead.acquire(NAME) is None
+    age(store, -ahead_s)
+    held = waiting.acquire(NAME)
+    assert held is not None
+    assert held.silent_s < 250
+    clocks.now += 290
+    os.utime(lock, (time.time() + ahead_s, time.time() + ahead_s + 30))  # touched: it was alive
+    assert waiting.acquire(NAME) is not None
+    clocks.now += 290
+    assert waiting.acquire(NAME) is not None
+    assert another.acquire(NAME) is not None
+    clocks.now += 10
+    assert another.acquire(NAME) is not None, "it has looked for ten seconds only"
+    assert waiting.acquire(NAME) is None
+    assert waiting.holds(NAME)
+
+
+def test_a_lock_that_its_holder_did_not_live_to_write_is_taken_soon(store, monkeypatch):
+    (store / ".writing").mkdir()
+    (store / ".writing" / f"{NAME}.lock").touch()
+    age(store, 9)
+    mine = episode_locks(store, worker(1))
+    assert mine.acquire(NAME) is not None
+    age(store, 11)
+    assert mine.acquire(NAME) is None
+
+
+def test_a_holder_that_stood_still_before_it_wrote_its_lock_does_not_believe_it_has_it(store, monkeypatch):
+    slow, quick = episode_locks(store, worker(1)), episode_locks(store, worker(2))
+    write = os.write
+
+    def stands_still(handle: int, content: bytes) -> int:
+        monkeypatch.undo()
+        age(store, 11)
+        assert quick.acquire(NAME) is None
+        return write(handle, content)
+
+    monkeypatch.setattr(os, "write", stands_still)
+    held = slow.acquire(NAME)
+    assert held is not None
+    assert held.worker == quick.worker
+    assert quick.holds(NAME)
+
+
+def test_a_folder_of_locks_that_goes_away_while_it_is_made_is_made_again(store, monkeypatch):
+    make, times = os.mkdir, []
+
+    def made_and_removed_by_another(path: object, *arguments: object) -> None:
+        make(path, *arguments)
+        if not times:
+            times.append(1)
+            os.rmdir(path)
+            raise FileExistsError(17, "File exists")
+
+    monkeypatch.setattr(os, "mkdir", made_and_removed_by_another)
+    assert episode_locks(store, worker(1)).acquire(NAME) is None
+
+
 def test_a_stopped_holder_does_not_touch_its_successor(store):
     first, second = episode_locks(store, worker(1)), episode_locks(store, worker(2))
     first.touch_every_s = 0.02
@@ -158,6 +233,21 @@ def test_of_two_that_found_the_same_dead_holder_one_replaces_it(store, monkeypat
     assert held is not None
     assert held.worker == first.worker
     assert first.holds(NAME)
+
+
+def test_a_lock_that_may_not_be_deleted_is_no_error_of_its_holder(store, monkeypatch):
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    first, second = episode_locks(store, worker(1)), episode_locks(store, worker(2))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", refuse)
+        patch.setattr(Path, "unlink", refuse)
+        with first.part(NAME) as folder:
+            assert second.acquire(NAME) is not None
+        assert not folder.exists()
+    age(store, 301)
+    assert second.acquire(NAME) is None
 
 
 def test_a_living_holder_touches_its_lock(store):
