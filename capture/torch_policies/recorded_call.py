@@ -86,7 +86,9 @@ class WatchedCall(ReplanRecorder):
         #: Of a row of the batch, what changes it: asked at its first call.
         self._bias_of = cache(self._row_bias)
         self._before = self._state_before(calls[0])
-        looks = not run._looked_at_words and calls[0].inputs.repeat is not None
+        #: Whether it is looked at whether the instruction gets through: at first calls while the store has no episode.
+        self._looks = not calls[0].episode.num_replans and not run.store.committed()
+        looks = self._looks and calls[0].inputs.repeat is not None
         self._before_first = self._before or (RandomNumbers() if looks else None)
 
     def _state_before(self, one: RowOfCall) -> RandomNumbers | None:
@@ -176,12 +178,9 @@ class WatchedCall(ReplanRecorder):
         return record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed, plumbing)
 
     def _look_at_words(self, one: RowOfCall, prompt: Prompt, actions: NDArray[np.float64] | None) -> Plumbing | None:
-        """Return whether the instruction gets through, of the first call of a new store; None of later ones."""
+        """Return whether the instruction gets through; None where that is not asked of this call."""
         run, inputs = self._run, one.inputs
-        if run._looked_at_words:
-            return None
-        run._looked_at_words = True
-        if run.store.committed():  # of a run that is resumed, whose first episode has it
+        if not self._looks:
             return None
         found = look_at_words_heard(
             prompt, inputs.instruction, actions, inputs.repeat, self._before_first, run._embeddings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -346,6 +347,20 @@ def test_a_prefix_that_is_no_pass_over_the_sites_keys(tmp_path):
     assert "'small'" in said[0]
     assert not any(name.endswith("_queries_all") for name in changes_of(store))
     assert "without_word_bowl" in changes_of(store)
+
+
+def test_whether_words_get_through_is_asked_until_an_episode_is_there(tmp_path):
+    """The first episode is dropped: the next one has what was seen of it."""
+    policy = SamplingPolicy()
+    with va.record(tmp_path / "a.zarr", policy, layout=layout_with_prefix(), tokenizer=policy.tokenizer) as run:
+        for number in range(3):
+            with suppress(KeyError), run.episode(task_id=0, episode_index=number, instruction=TEXT) as episode:
+                with episode.replan(env_step=0, frames={"front": inputs(0)["pictures"]}) as block:
+                    block.actions = policy.sample(**inputs(0))
+                if number == 0:
+                    raise KeyError
+    seen = [episode.attributes.plumbing is not None for episode in open_store(tmp_path / "a.zarr").episodes]
+    assert seen == [True, False]
 
 
 def deaf_to(policy, replan):
