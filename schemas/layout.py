@@ -7,7 +7,7 @@ into the prompt; they are stored beside the rows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from typing import Literal
 
@@ -52,6 +52,7 @@ class Role(IntEnum):
     NULL = 14
     ABSENT = 15
     LEARNED = 16
+    BORDER = 17
 
     @property
     def label(self) -> str:
@@ -64,13 +65,14 @@ class Role(IntEnum):
 INVALID_ROLES = (Role.MASKED_IMAGE, Role.PADDING, Role.NULL, Role.ABSENT)
 #: Roles that a key of a span can have, by the span's kind; any key can be absent.
 ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
-    "image": (Role.IMAGE, Role.MASKED_IMAGE, Role.BLANK, Role.ABSENT),
+    "image": (Role.IMAGE, Role.MASKED_IMAGE, Role.BORDER, Role.BLANK, Role.ABSENT),
     "text": (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.STATE, Role.PADDING, Role.TEXT, Role.NULL, Role.ABSENT),
     "state": (Role.STATE, Role.LEARNED, Role.ABSENT),
     "action": (Role.ACTION, Role.ABSENT),
     "latent": (
         Role.IMAGE,
         Role.MASKED_IMAGE,
+        Role.BORDER,
         Role.ACTION,
         Role.PROPRIO,
         Role.BLANK,
@@ -104,6 +106,11 @@ def find_role(label: str) -> Role:
     raise unknown_name("role", label, [role.label for role in Role])
 
 
+#: (top, left, height, width) of a part of a picture, in fractions of the whole one.
+Part = tuple[Number, Number, Number, Number]
+WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
+
+
 class PatchGrid(Document, frozen=True):
     """How an image span's keys tile a camera's picture, or a part of it: row-major from the top left corner.
 
@@ -115,7 +122,7 @@ class PatchGrid(Document, frozen=True):
     columns: int
     image_height: int
     image_width: int
-    part: tuple[Number, Number, Number, Number] = (0.0, 0.0, 1.0, 1.0)
+    part: Part = WHOLE
 
     def __post_init__(self) -> None:
         """Check that the grid and the picture have a size, and that the part lies in the picture."""
@@ -162,6 +169,23 @@ class PatchGrid(Document, frozen=True):
         """
         top, left, height, width = self.part
         return _shares(self.rows, top, height, rows), _shares(self.columns, left, width, columns)
+
+    def shown(self, part: Part) -> NDArray[np.float64]:
+        """How much of every patch lies in a part of the whole picture, (patch,), from 0 to 1."""
+        along = [
+            np.clip(
+                (np.minimum(centre + half, first + length) - np.maximum(centre - half, first)) / (2 * half), 0.0, 1.0
+            )
+            for centre, half, first, length in zip(
+                self.centres(),
+                (self.part[2] / self.rows / 2, self.part[3] / self.columns / 2),
+                part[:2],
+                part[2:],
+                strict=True,
+            )
+        ]
+        areas, whole = (areas := np.outer(*along).ravel()), np.rint(areas)
+        return np.where(np.abs(areas - whole) < 1000 * _ROUNDING, whole, areas)
 
     def describe(self) -> str:
         """The grid in words."""
@@ -437,6 +461,41 @@ def prompt_at(sites: Sequence[SiteLayout], layout: SiteLayout, prompt: Prompt) -
         if span is not None and span_here is not None and piece.key - span.start < span_here.num_keys:
             pieces.append(replace(piece, key=piece.key - span.start + span_here.start))
     return replace(prompt, pieces=tuple(pieces))
+
+
+def fitted_part(given: tuple[int, int], size: tuple[int, int], towards: float = 0.5) -> Part:
+    """The part of a picture of a model that shows a camera's picture, resized with its aspect ratio kept.
+
+    given, size: height and width in pixels of the camera's picture and of the model's. towards: where it lies in the
+    room that is left, 0.5 in the middle.
+    """
+    factor = max(mine / other for mine, other in zip(given, size, strict=True))
+    inner = [max(1, int(side / factor)) for side in given]
+    before = [int((whole - side) * towards) for whole, side in zip(size, inner, strict=True)]
+    (height, width), (rows, columns), (top, left) = size, inner, before
+    return top / height, left / width, rows / height, columns / width
+
+
+def borders(layout: SiteLayout, shown: Mapping[str, Part]) -> NDArray[np.float32] | None:
+    """How much of each key's patch shows no picture, (key,); None where all patches show one.
+
+    shown: camera -> the part of the model's picture that shows the camera's; all of it for others.
+    """
+    found = np.zeros(layout.num_keys, dtype=np.float32)
+    for camera, part in shown.items():
+        if camera in layout.pictured:
+            found[layout.patch_keys(camera)] = 1.0 - np.concatenate([grid.shown(part) for grid in layout.grids(camera)])
+    return found if found.any() else None
+
+
+def with_borders(layout: SiteLayout, roles: NDArray[np.uint8], shown: Mapping[str, Part]) -> NDArray[np.uint8]:
+    """Roles (key,) with `border` for the patches that show no picture at all."""
+    of_keys = borders(layout, shown)
+    if of_keys is None:
+        return roles
+    marked = roles.copy()
+    marked[(of_keys == 1.0) & (roles == Role.IMAGE)] = Role.BORDER
+    return marked
 
 
 def roles_from_spans(layout: SiteLayout, role_of_span: dict[str, Role]) -> NDArray[np.uint8]:

@@ -7,6 +7,8 @@ import polars as pl
 
 from vla_attention.analyze.core.measure import Items
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.schemas.groupings.resolve import weights_of
+from vla_attention.schemas.groupings.selector_parser import parse_selector
 from vla_attention.schemas.groupings.words import word_class
 from vla_attention.schemas.layout import Role
 
@@ -19,6 +21,7 @@ SCALE = {
     Role.TEXT: "other text",
     Role.STATE: "state digits",
     Role.IMAGE: "image patches",
+    Role.BORDER: "border of pictures",
 }
 LABELS = {"kind": pl.String, "item": pl.String, "place": pl.Int64, "word_class": pl.String}
 
@@ -57,7 +60,7 @@ def items_of(item: SelectedEpisode) -> Items:
         of_words[tuple(np.array(cells).T)] = 1.0
         weights[..., : len(members)] = of_words[at]
     for i, role in enumerate(named, len(members)):
-        weights[..., i] = roles == role
+        weights[..., i] = weights_of(parse_selector(f"role:{role.label}"), tokens)
     names = [*members, *(("scale", SCALE[role], None, None) for role in named)]
     labels = {
         column: pl.Series(column, [name[i] for name in names], dtype=dtype)

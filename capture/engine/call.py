@@ -180,4 +180,5 @@ def record_of(
         constant_cameras=call.constant_cameras,
         effects=measured,
         plumbing=plumbing,
+        shown=given.shown,
     )

@@ -21,7 +21,7 @@ from vla_attention.capture.environments.base import (
 )  # policies and their users import it here
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.recording.attention import AttentionEditor, FactorEditor, RowCollector
-from vla_attention.schemas.layout import Prompt, SiteLayout, picture_size
+from vla_attention.schemas.layout import Part, Prompt, SiteLayout, picture_size
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
 
@@ -32,6 +32,7 @@ class PolicyInput:
     frames: camera -> (height, width, 3) uint8, the images as the model sees them. key_role: site -> (key,) uint8 codes
     of `Role`. state: (state dim,) float64, not normalised. tensors: the model's inputs by its own names, batch 1.
     camera_frames: camera -> (height, width, 3) uint8, the cameras' own pictures, if the policy `needs_camera_frames`.
+    shown: camera -> the part of its frame that shows the camera's picture, where the rest is a border.
     """
 
     frames: Mapping[str, NDArray[np.uint8]]
@@ -40,11 +41,12 @@ class PolicyInput:
     state: NDArray[np.float64]
     tensors: Mapping[str, Tensor]
     camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    shown: Mapping[str, Part] = field(default_factory=dict)
 
     @property
     def given(self) -> GivenInputs:
         """What this input was made of; `Policy.prepare_again` makes the same input of it."""
-        return GivenInputs(self.frames, self.camera_frames, self.state, self.prompt.instruction_text)
+        return GivenInputs(self.frames, self.camera_frames, self.state, self.prompt.instruction_text, self.shown)
 
 
 @dataclass(frozen=True)
@@ -54,12 +56,14 @@ class GivenInputs:
     frames: camera -> (height, width, 3) uint8, the images as the model sees them. camera_frames: camera -> the camera's
     own picture. Where there is one, the model's image is made of it, and `frames` is not used: a changed picture of
     `frames` needs the camera's own one removed. state: (state dim,) float64, not normalised. instruction: may be empty.
+    shown: as in `PolicyInput`, of frames without the camera's own picture.
     """
 
     frames: Mapping[str, NDArray[np.uint8]]
     camera_frames: Mapping[str, NDArray[np.uint8]]
     state: NDArray[np.float64]
     instruction: str
+    shown: Mapping[str, Part] = field(default_factory=dict)
 
 
 class ModelSizes(Protocol):

@@ -58,6 +58,7 @@ class StoredCalls:
             camera_frames=self._pictures("camera_frames", replan),
             state=self.state[replan],
             instruction=prompt.instruction_text,
+            shown=self.attributes.shown,
         )
 
     def _pictures(self, group: str, replan: int) -> dict[str, NDArray[np.uint8]]:

@@ -188,6 +188,8 @@ class EpisodeWriter:
     def _misfits(self, record: ReplanRecord) -> Iterator[str]:
         """Where a replan differs in form from the run's plan or the first one, so that arrays could not be stacked."""
         first = self.records[0] if self.records else record
+        if record.shown != first.shown:
+            yield f"its pictures show the parts {dict(record.shown)} of their frames, and before {dict(first.shown)}"
         given, before = _shapes_of_replan(record), _shapes_of_replan(first)
         for name in sorted(given.keys() | before.keys()):
             here, there = (f"of the shape {of[name]}" if name in of else "not given" for of in (given, before))
@@ -265,6 +267,7 @@ class EpisodeWriter:
             ),
             steps=None if steps is None else steps.attributes,
             plumbing=next((record.plumbing for record in records if record.plumbing is not None), None),
+            shown=dict(records[0].shown),
         )
 
     @contextmanager

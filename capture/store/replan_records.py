@@ -13,7 +13,7 @@ from vla_attention.schemas.effects import CHANGE, CUT, EffectItem
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, EpisodeSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.layout import Part, Prompt
 from vla_attention.schemas.plumbing import Plumbing
 
 
@@ -74,7 +74,7 @@ class ReplanRecord:
     on, fewer at the end of its episode. `base_actions` (horizon, action_dim) are those that the base has for this call,
     in a rerun. What is None is not known; all replans of an episode know the same. `constant_cameras`: cameras of the
     simulator whose picture is of one colour. `effects`: None where they are not measured at this replan. `plumbing`: of
-    the first call of a process.
+    the first call of a process. `shown`: camera -> the part of its frame that shows its picture, where that is not all.
     """
 
     env_step: int
@@ -92,6 +92,7 @@ class ReplanRecord:
     constant_cameras: frozenset[str] = frozenset()
     effects: ReplanEffects | None = None
     plumbing: Plumbing | None = None
+    shown: Mapping[str, Part] = field(default_factory=dict)
 
     @property
     def arrays(self) -> dict[str, tuple[NDArray[Any], tuple[str, ...]]]:

@@ -164,7 +164,14 @@ class WatchedCall(ReplanRecorder):
         if data is not None and actions is not None:
             data = data[: len(actions)]  # beyond the policy's chunk there is nothing to compare
         call = PolicyCall(
-            CallInput(inputs.frames, key_role, prompt, NO_STATE if inputs.state is None else inputs.state, {}),
+            CallInput(
+                inputs.frames,
+                key_role,
+                prompt,
+                NO_STATE if inputs.state is None else inputs.state,
+                {},
+                shown=inputs.shown,
+            ),
             OWN_NOISE,
             one.context,
             inputs.env_step,

@@ -16,7 +16,7 @@ from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.layout import Prompt, camera_grids, picture_size
+from vla_attention.schemas.layout import WHOLE, Part, Prompt, camera_grids, fitted_part, picture_size
 from vla_attention.schemas.safe_text import check_text
 
 
@@ -97,6 +97,7 @@ class ReplanInputs:
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     dataset_actions: NDArray[np.float64] | None = None
     repeat: Repeat | None = None
+    shown: Mapping[str, Part] = field(default_factory=dict)
 
 
 def whole_number(what: str, given: Any) -> int:
@@ -126,7 +127,7 @@ def _numbers(what: str, given: Any, axes: int, expected: str) -> NDArray[np.floa
 
 #: Parameters that take any number of arguments.
 _REST = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
-_NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name != "env_step")
+_NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name not in ("env_step", "shown"))
 
 
 def read_inputs(
@@ -163,12 +164,13 @@ def read_inputs(
                     f"The camera '{camera}' has no patches in the layout, so that its picture has no size: leave it "
                     f"out of {what}, or give a span of it a grid (va.PatchGrid)."
                 )
-    pictures = values.get("frames", {})
-    frames = {
-        camera: model_picture(pictures[camera], camera, picture_size(sites, camera), fits.get(camera, "stretch"))
-        for camera in cameras
-        if camera in pictures
-    }
+    pictures, shown = values.get("frames", {}), dict[str, Part]()
+    frames = {}
+    for camera in cameras:
+        if camera in pictures:
+            size, fit = picture_size(sites, camera), fits.get(camera, "stretch")
+            frames[camera], part = model_picture(pictures[camera], camera, size, fit)
+            shown |= {camera: part} if part != WHOLE else {}
     coverage = {camera: np.asarray(array, dtype=np.float32) for camera, array in values.get("coverage", {}).items()}
     for camera, mask in values.get("masks", {}).items():
         coverage[camera] = camera_coverage(np.asarray(mask), len(facts.objects), camera_grids(sites, camera))
@@ -186,6 +188,7 @@ def read_inputs(
         coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
         dataset_actions=_numbers("dataset_actions", values.get("dataset_actions"), 2, "(step, action_dim)"),
         repeat=_repeat(values, facts),
+        shown=shown,
     )
 
 
@@ -212,8 +215,8 @@ def read_actions(given: Any) -> NDArray[np.float64] | None:
     return _numbers("actions", given, 2, "(horizon, action_dim) or (action_dim,)")
 
 
-def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: PictureFit) -> NDArray[np.uint8]:
-    """Return a camera's picture as (height, width, 3) uint8 of the model's input size.
+def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: PictureFit) -> tuple[NDArray[np.uint8], Part]:
+    """Return a camera's picture as (height, width, 3) uint8 of the model's input size, and the part that shows it.
 
     picture: (height, width, 3) uint8, or (3, height, width) with numbers from 0 to 1, as an array or a tensor; a batch
     axis of length 1 may come first. fit: how other sizes become the model's, see `CameraPicture`.
@@ -224,14 +227,13 @@ def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: Picture
     levels = _levels(picture, camera)
     height, width = size
     if levels.shape[:2] == (height, width):
-        return levels
+        return levels, WHOLE
     if fit == "stretch":
-        return _resized(levels, height, width)
-    factor = max(levels.shape[0] / height, levels.shape[1] / width)
-    inner = _resized(levels, max(1, int(levels.shape[0] / factor)), max(1, int(levels.shape[1] / factor)))
-    below, beside = height - inner.shape[0], width - inner.shape[1]
-    top, left = (below, beside) if fit == "pad_left_top" else (below // 2, beside // 2)
-    return np.pad(inner, ((top, below - top), (left, beside - left), (0, 0)))
+        return _resized(levels, height, width), WHOLE
+    part = fitted_part((levels.shape[0], levels.shape[1]), size, 1.0 if fit == "pad_left_top" else 0.5)
+    top, left, rows, columns = (round(side * whole) for side, whole in zip(part, size * 2, strict=True))
+    inner = _resized(levels, rows, columns)
+    return np.pad(inner, ((top, height - rows - top), (left, width - columns - left), (0, 0))), part
 
 
 def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:

@@ -21,7 +21,7 @@ from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, Rec
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit, TokenText, find_instruction, state_pieces
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
-from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role, roles_from_spans
+from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role, roles_from_spans, with_borders
 
 
 class KeysShifted(BadArgument):
@@ -208,7 +208,7 @@ class ReplanText:
                 roles[keys_of_span][~valid[keys_of_span]] = site.masked_role(span)
             if present is not None:
                 roles[keys_of_span][~present[keys_of_span]] = Role.ABSENT
-        return roles
+        return with_borders(site.keys, roles, self.inputs[row].shown)
 
     def _name_text(self, roles: NDArray[np.uint8], row: int, site: RecordedSite, prompt: Prompt) -> None:
         """Give the keys of the prompt the roles of their pieces."""

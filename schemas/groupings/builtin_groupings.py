@@ -30,10 +30,13 @@ def _others(vocabulary: Vocabulary) -> dict[str, tuple[str, ...]]:
     """Groups of all other keys, so that the masses of a grouping sum to the row sum."""
     # Cosmos's padded text takes attention and adds nothing.
     null = {"null": ("role:null",)} if "null" in vocabulary.roles else {}
+    # Patches of a letterbox, beside a picture of another shape: they take attention and show nothing.
+    border = {"border": ("role:border",)} if "border" in vocabulary.roles else {}
     return {
         "state": ("role:state | role:proprio",),
         "action": ("role:action",),
         **null,
+        **border,
         "padding": ("role:padding",),
         "masked": ("role:masked_image",),
         "other": ("*",),

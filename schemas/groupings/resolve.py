@@ -1,8 +1,8 @@
 """From a grouping and an episode's tokens to a weight per key and group, with the checks of names and overlaps.
 
-An object covers a fraction of a patch, so sets of keys are not enough. Every key is divided into cells, one per scene
-object (a key without object coverage has one cell). A selector is a set of (key, cell) pairs, so that union,
-intersection and difference are exact. A key's weight is the covered area of its chosen cells.
+An object covers a fraction of a patch, and a letterbox cuts some, so sets of keys are not enough. Every key is divided
+into cells, one per scene object (a key without object coverage has one cell). A selector is a set of (key, cell) pairs,
+so that union, intersection and difference are exact. A key's weight is the covered area of its chosen cells.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vla_attention.schemas.groupings.selector_parser import (
     folded,
     parse_selector,
 )
-from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys
+from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys, num_cells
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 
 
@@ -171,11 +171,15 @@ def describe_key(key: int, tokens: EpisodeTokens) -> str:
 
 
 def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
-    """Area of each key's cells, shape (replan, key, 1 + object); they sum to 1. Cell 0 is what no object covers."""
+    """Area of each key's cells (`num_cells`), shape (replan, key, cell); they sum to 1."""
     replans, keys, things = tokens.num_replans, tokens.layout.num_keys, len(tokens.objects)
-    area = np.zeros((replans, keys, 1 + things), dtype=np.float32)
+    area = np.zeros((replans, keys, num_cells(tokens)), dtype=np.float32)
     for camera, coverage in (tokens.coverage or {}).items():
-        area[:, tokens.layout.patch_keys(camera), 1:] = coverage
+        area[:, tokens.layout.patch_keys(camera), 1 : 1 + things] = coverage
+    if tokens.border is not None and tokens.has_cut_patches:
+        # Objects are in what shows a picture, of which they cover the same shares.
+        area *= 1.0 - tokens.border[:, None]
+        area[:, :, -1] = tokens.border
     area[:, :, 0] = np.clip(1.0 - area[:, :, 1:].sum(axis=2), 0.0, 1.0)
     return area
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.errors import UserError, did_you_mean, listing
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, EpisodeTokens, Vocabulary
 from vla_attention.schemas.groupings.words import Word, find_phrase, has_phrase, split_words, word_class
-from vla_attention.schemas.layout import find_role
+from vla_attention.schemas.layout import Role, find_role
 
 #: The (key, cell) pairs that a selector takes, axes (replan or 1, key, cell or 1). `resolve` says what a cell is.
 Membership = NDArray[np.bool_]
@@ -50,6 +50,11 @@ class SelectorKind:
     keys: Callable[[str, EpisodeTokens], Membership]
     problem: Callable[[str, Vocabulary], str | None]
     has_keys: Callable[[Vocabulary], bool] = lambda names: True
+
+
+def num_cells(tokens: EpisodeTokens) -> int:
+    """Cells of a key: what no object covers, one for each object, and what of a patch shows no picture."""
+    return 1 + len(tokens.objects) + tokens.has_cut_patches
 
 
 def no_keys(tokens: EpisodeTokens) -> Membership:
@@ -107,8 +112,19 @@ def _frame_problem(argument: str, vocabulary: Vocabulary) -> str | None:
 
 
 def _role_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    member: Membership = (tokens.static_roles == int(find_role(argument)))[:, :, None]
-    return member
+    role = find_role(argument)
+    member: Membership = (tokens.static_roles == int(role))[:, :, None]
+    if tokens.border is None or not tokens.has_cut_patches or role not in (Role.IMAGE, Role.BORDER):
+        return member
+    # Of a patch that shows a picture in part, the last cell is the rest.
+    is_rest = np.zeros(num_cells(tokens), dtype=bool)
+    is_rest[-1] = True
+    if role == Role.IMAGE:
+        shown: Membership = member & ~is_rest
+        return shown
+    cut = (tokens.static_roles == int(Role.IMAGE)) & (tokens.border > 0)
+    hidden: Membership = member | (cut[:, :, None] & is_rest)
+    return hidden
 
 
 def _role_problem(argument: str, vocabulary: Vocabulary) -> str | None:
@@ -175,7 +191,7 @@ def _keys_of_words(tokens: EpisodeTokens, chosen: Sequence[Sequence[Word]]) -> M
 
 
 def _object_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    chosen = np.zeros(1 + len(tokens.objects), dtype=bool)
+    chosen = np.zeros(num_cells(tokens), dtype=bool)
     for i, thing in enumerate(tokens.objects, start=1):
         chosen[i] = {
             "@interest": thing.of_interest,

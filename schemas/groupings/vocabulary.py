@@ -57,6 +57,7 @@ class EpisodeTokens:
         prompt_index: which prompt each replan had, shape (replan,).
         objects: the scene's objects, in the order of the coverage's last axis.
         coverage: per camera the area of each patch that each object covers, shape (replan, patch, object), 0..1.
+        border: the part of each key's patch that shows no picture, shape (key,), 0..1; None where all show one.
     """
 
     layout: SiteLayout
@@ -65,6 +66,7 @@ class EpisodeTokens:
     prompt_index: NDArray[np.integer] | None = None
     objects: tuple[SceneObject, ...] = ()
     coverage: Mapping[str, NDArray[np.float32]] | None = None
+    border: NDArray[np.float32] | None = None
 
     @property
     def num_replans(self) -> int:
@@ -75,6 +77,11 @@ class EpisodeTokens:
     def static_roles(self) -> NDArray[np.uint8]:
         """`key_role` as (1, key) when it never changes in the episode, else as stored."""
         return self.key_role[:1] if (self.key_role == self.key_role[:1]).all() else self.key_role
+
+    @cached_property
+    def has_cut_patches(self) -> bool:
+        """Whether there are patches of which a part shows a picture, and a part shows none."""
+        return self.border is not None and bool(((self.border > 0) & (self.border < 1)).any())
 
     @cached_property
     def words(self) -> tuple[tuple[Word, ...], ...]:
@@ -146,6 +153,8 @@ class Names:
             if (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
                 self._cameras[span.camera] = None
         self._roles.update({Role(code).label: None for code in np.unique(tokens.static_roles)})
+        if tokens.has_cut_patches:
+            self._roles[Role.BORDER.label] = None
         self.add_words(tokens.words)
         if tokens.coverage:
             self.add_objects(tokens.objects)

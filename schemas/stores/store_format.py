@@ -31,6 +31,7 @@ from __future__ import annotations
 import re
 from typing import Any, Literal, NamedTuple
 
+from msgspec import field
 from msgspec.structs import replace
 
 from vla_attention.schemas.effects import EffectsRecorded, EpisodeEffects
@@ -39,7 +40,7 @@ from vla_attention.schemas.errors import BadArgument, UserError, listing, unknow
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.jsonable import Document, Number
-from vla_attention.schemas.layout import Prompt, SiteLayout
+from vla_attention.schemas.layout import Part, Prompt, SiteLayout
 from vla_attention.schemas.plumbing import Plumbing
 from vla_attention.schemas.safe_text import check_inner_path, check_name, check_text
 from vla_attention.schemas.segments import Segment
@@ -350,7 +351,8 @@ class EpisodeAttributes(Document, frozen=True):
     effects are of; None where none were measured. `steps`: the same of the arrays of steps; None where no simulator of
     ours ran the episode. `scene_task_id`: the task whose scene and initial state an exchanged episode began with; None
     for an episode that began with its own. `plumbing`: of the first planned episode of each
-    task, or of the first one of a new store.
+    task, or of the first one of a new store. `shown`: camera -> the part (top, left, height, width) of its frames that
+    shows its picture, in fractions, where the rest is a border.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`
@@ -381,6 +383,7 @@ class EpisodeAttributes(Document, frozen=True):
     steps: EpisodeSteps | None = None
     scene_task_id: int | None = None
     plumbing: Plumbing | None = None
+    shown: dict[str, Part] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check the task's name, and the names of arrays, which are paths."""

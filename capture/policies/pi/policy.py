@@ -33,7 +33,17 @@ from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind, roles_from_spans
+from vla_attention.schemas.layout import (
+    WHOLE,
+    PatchGrid,
+    Role,
+    SiteLayout,
+    Span,
+    SpanKind,
+    fitted_part,
+    roles_from_spans,
+    with_borders,
+)
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
@@ -168,11 +178,18 @@ class PiPolicy:
             cut=self.processing.cut_long_prompts,
         )
         self._warn_of_cut(tokenized, given.instruction)
+        shown = {name: part for name, part in given.shown.items() if name not in given.camera_frames}
+        shown |= {
+            name: part
+            for name, picture in given.camera_frames.items()
+            if (part := fitted_part((picture.shape[0], picture.shape[1]), (size, size))) != WHOLE
+        }
         roles = {camera: Role.IMAGE if camera in pictures else Role.MASKED_IMAGE for camera in config.cameras}
         # The prompt's own roles replace the placeholder below.
         roles |= {PROMPT_SPAN: Role.TEXT, STATE_SPAN: Role.STATE, ACTION_SPAN: Role.ACTION}
         key_role = roles_from_spans(layout, roles)
         key_role[prompt_span.start : prompt_span.stop] = tokenized.roles
+        key_role = with_borders(layout, key_role, shown)
 
         black = torch.full((1, 3, size, size), -1.0)
         # Masks stay in the processor's memory, as `PiModel.sample_actions` wants them.
@@ -192,6 +209,7 @@ class PiPolicy:
             state=given.state,
             tensors=tensors,
             camera_frames=given.camera_frames,
+            shown=shown,
         )
 
     def _warn_of_cut(self, tokenized: TokenizedPrompt, instruction: str) -> None:
