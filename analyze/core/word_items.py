@@ -7,8 +7,6 @@ import polars as pl
 
 from vla_attention.analyze.core.measure import Items
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.schemas.groupings.resolve import weights_of
-from vla_attention.schemas.groupings.selector_parser import parse_selector
 from vla_attention.schemas.groupings.words import word_class
 from vla_attention.schemas.layout import Role
 
@@ -60,7 +58,8 @@ def items_of(item: SelectedEpisode) -> Items:
         of_words[tuple(np.array(cells).T)] = 1.0
         weights[..., : len(members)] = of_words[at]
     for i, role in enumerate(named, len(members)):
-        weights[..., i] = weights_of(parse_selector(f"role:{role.label}"), tokens)
+        shown = 1.0 if tokens.border is None or role != Role.IMAGE else 1.0 - tokens.border
+        weights[..., i] = (roles == role) * shown
     names = [*members, *(("scale", SCALE[role], None, None) for role in named)]
     labels = {
         column: pl.Series(column, [name[i] for name in names], dtype=dtype)

@@ -176,7 +176,7 @@ def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
     area = np.zeros((replans, keys, num_cells(tokens)), dtype=np.float32)
     for camera, coverage in (tokens.coverage or {}).items():
         area[:, tokens.layout.patch_keys(camera), 1 : 1 + things] = coverage
-    if tokens.border is not None and tokens.has_cut_patches:
+    if tokens.border is not None:
         # Objects are in what shows a picture, of which they cover the same shares.
         area *= 1.0 - tokens.border[:, None]
         area[:, :, -1] = tokens.border

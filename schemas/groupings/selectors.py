@@ -54,7 +54,7 @@ class SelectorKind:
 
 def num_cells(tokens: EpisodeTokens) -> int:
     """Cells of a key: what no object covers, one for each object, and what of a patch shows no picture."""
-    return 1 + len(tokens.objects) + tokens.has_cut_patches
+    return 1 + len(tokens.objects) + (tokens.border is not None)
 
 
 def no_keys(tokens: EpisodeTokens) -> Membership:
@@ -201,6 +201,8 @@ def _object_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     covered = np.zeros(tokens.layout.num_keys, dtype=bool)
     for camera in tokens.coverage or {}:
         covered[tokens.layout.patch_keys(camera)] = True
+    if tokens.border is not None:
+        covered &= tokens.border < 1
     member: Membership = (covered[:, None] & chosen)[None]
     return member
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import strategies as st
 
 from tests.kit.tokens import SpelledPrompt, spell_prompt, tokens_of
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, ObjectKind, SceneObject
-from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind, borders, with_borders
 
 NOUNS = ("bowl", "plate", "drawer", "stove", "mug")
 #: Parts of its picture that a span of a camera covers; None: a token that lies nowhere in it.
 PARTS = ((0.0, 0.0, 1.0, 1.0), (0.0, 0.5, 0.5, 0.5), (0.5, 0.0, 0.5, 1.0), (1 / 3, 0.125, 1 / 3, 0.5), None)
+#: Parts of a camera's frame that show its picture; None: all of it.
+SHOWN = (None, None, (0.125, 0.0, 0.75, 1.0), (0.0, 0.3, 1.0, 0.4), (0.25, 0.0, 0.5, 1.0))
 OBJECTS: dict[str, ObjectKind] = {
     "bowl_1": "object",
     "plate_1": "object",
@@ -60,7 +64,10 @@ def episode_tokens(draw: st.DrawFn) -> EpisodeTokens:
             patches = len(layout.patch_keys(camera))
             share = np.random.default_rng(seed).dirichlet(np.full(len(objects), 0.4), size=(replans, patches))
             coverage[camera] = share.astype(np.float32)
-    return tokens_of(layout, prompts, objects, coverage, masked)
+    tokens = tokens_of(layout, prompts, objects, coverage, masked)
+    shown = {camera: part for camera in coverage if (part := draw(st.sampled_from(SHOWN))) is not None}
+    roles = np.stack([with_borders(layout, of_replan, shown) for of_replan in tokens.key_role])
+    return replace(tokens, key_role=roles, border=borders(layout, shown))
 
 
 @st.composite
@@ -87,7 +94,7 @@ def groupings(draw: st.DrawFn, tokens: EpisodeTokens) -> Grouping:
     assert tokens.prompt_index is not None
     choices = [
         *(f"camera:{camera}" for camera in cameras),
-        *(f"role:{role}" for role in ("image", "instruction", "template", "action", "padding", "state")),
+        *(f"role:{role}" for role in ("image", "border", "instruction", "template", "action", "padding", "state")),
         *(f"span:{span.name}" for span in tokens.layout.spans),
         *(f"word:{word}" for word in sorted({word.text for i in set(tokens.prompt_index) for word in tokens.words[i]})),
         *(f"object:{name}" for name in (*OBJECTS, "@interest", "@robot", "@background")),

@@ -58,7 +58,7 @@ def test_role_codes_never_change():
     assert {role.label: int(role) for role in Role} == {
         "image": 1, "masked_image": 2, "bos": 3, "template": 4, "instruction": 5, "state": 6, "padding": 7,
         "action": 8, "proprio": 9, "blank": 10, "future": 11, "value": 12, "text": 13, "null": 14,
-        "absent": 15, "learned": 16,
+        "absent": 15, "learned": 16, "border": 17,
     }  # fmt: skip
     assert find_role("Image") is Role.IMAGE
 

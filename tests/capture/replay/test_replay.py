@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import zarr
 
+import vla_attention as va
 from tests.kit.lerobot_data_sets import H264, episodes_of_store, made_up_episodes, number_of, write_data_set
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
@@ -17,6 +18,7 @@ from tests.kit.still_scene import capture_without_simulator
 from tests.thorough.hostile_data_sets.run_cases import CASES
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 
 LIBERO_COLUMNS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
@@ -172,6 +174,27 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
     changed, base = (episode(path, 0, 0) for path in (made_again, store))
     assert not np.array_equal(changed["actions"][:], base["actions"][:])
     np.testing.assert_array_equal(changed["dataset_actions"][:], base["dataset_actions"][:])
+
+
+def test_the_border_beside_a_picture_that_is_fitted_in_is_no_picture(tmp_path):
+    """Pictures of 64 x 96 fill rows 5 to 22 of 28: of each of the 2 x 2 patches of 14 rows, 9 show something."""
+    data = write_data_set(tmp_path / "data", "v3.0", made_up_episodes((8,), tuple(LIBERO_COLUMNS.values())))
+    store = tmp_path / "replay.zarr"
+    assert run("replay", data, *TINY, "--action", "none", "--output", store) == 0
+    assert run("rerun", store, "--knockout", "camera:base_0_rgb", "--output", tmp_path / "cut.zarr") == 0
+    for path in (store, tmp_path / "cut.zarr"):
+        stored = episode(path, 0, 0)
+        assert stored.attrs["shown"] == {camera: pytest.approx([5 / 28, 0, 18 / 28, 1]) for camera in LIBERO_COLUMNS}
+    stored = episode(store, 0, 0)
+    for camera in LIBERO_COLUMNS:
+        seen = stored[f"frames/{camera}"][:].any(axis=(0, 2, 3))
+        np.testing.assert_array_equal(seen, [5 <= row < 23 for row in range(28)])
+    groups = {row["group"]: row for row in va.open(store).analyze()["tasks_groups"].iter_rows(named=True)}
+    rows, roles = stored["joint/rows"][:].mean(axis=(1, 2, 3, 4)), stored["joint/key_role"][:]
+    whole = (rows * (roles == Role.IMAGE)).sum(axis=1).mean()
+    for group, part in (("visual", 9 / 14), ("border", 5 / 14)):
+        assert groups[group]["mass"] == pytest.approx(whole * part, rel=1e-4)
+        assert groups[group]["keys"] == pytest.approx(8 * part)
 
 
 def test_mistakes_end_with_one_line(tmp_path, capsys, monkeypatch):

@@ -102,6 +102,21 @@ def computed(policy, inputs):
     return found
 
 
+def test_what_is_fitted_in_says_what_of_it_shows(tmp_path):
+    """A picture of 4 x 8 in the middle of 8 x 8: of each of the 2 x 2 patches one half shows it."""
+    policy = SmallPolicy()
+    layout = small_layout(cameras=(va.CameraPicture("front", fit="pad"),))
+    with (
+        va.record(tmp_path / "a.zarr", policy, layout=layout, tokenizer=policy.tokenizer) as run,
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+        episode.replan(env_step=0, frames={"front": np.full((4, 8, 3), 9, np.uint8)}) as replan,
+    ):
+        replan.actions = policy.act(**given())
+    groups = va.open(tmp_path / "a.zarr").analyze()["tasks_groups"].filter(layer="layers_avg")
+    counted = dict(groups.select("group", "keys").iter_rows())
+    assert (counted["visual"], counted["border"]) == (2.0, 2.0)
+
+
 def test_the_rows_are_those_that_the_policy_computes(tmp_path, policy):
     with start(tmp_path, policy, bits=23) as run:
         fill(run, policy)

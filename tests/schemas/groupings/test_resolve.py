@@ -226,3 +226,14 @@ def test_reference_on_latent_frames_and_where_it_makes_no_sense():
         BUILTIN_GROUPINGS["reference"](collect_vocabulary([text]))
     with pytest.raises(GroupingError, match="'reference:200'"):
         find_grouping("reference:200", collect_vocabulary([latent]))
+
+
+@given(data=st.data())
+def test_what_shows_no_picture_is_no_picture(data):
+    """Pictures, border and masked patches share all keys of cameras, a patch by what of it shows a picture."""
+    tokens = data.draw(episode_tokens())
+    image, border = (weights(tokens, f"role:{role}") for role in ("image", "border"))
+    seen = np.isin(tokens.static_roles, [Role.IMAGE, Role.BORDER])
+    rest = np.zeros(tokens.layout.num_keys) if tokens.border is None else tokens.border
+    for found, wanted in ((image, 1 - rest), (border, rest)):
+        np.testing.assert_allclose(found, np.broadcast_to(np.where(seen, wanted, 0.0), found.shape), atol=1e-6)

@@ -9,6 +9,7 @@ from PIL import Image
 from tests.kit.pi_golden import GOLDEN
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.config import find_config
+from vla_attention.capture.policies.pi.lerobot import lerobot_pictures
 from vla_attention.capture.policies.pi.preprocess import (
     NormStats,
     Statistics,
@@ -22,7 +23,9 @@ from vla_attention.capture.policies.pi.preprocess import (
 )
 from vla_attention.capture.policies.pi.processing import openpi_processing, simulated_arm
 from vla_attention.capture.policies.pi.tokenizer import digitise_state
+from vla_attention.capture.torch_policies.replan_inputs import model_picture
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.layout import PatchGrid, fitted_part
 
 FOLDER = GOLDEN / "libero_preproc"
 MODES = {"z-score": "z", "quantile": "q"}
@@ -49,6 +52,27 @@ def test_images_are_rotated_and_resized_within_one_grey_level(inputs, expected, 
         got = resize_with_pad(turn(frame), 224)
         assert got.dtype == np.uint8
         assert np.abs(got.astype(int) - wanted.astype(int)).max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (720, 1280), (640, 480), (64, 96), (100, 333), (224, 224), (256, 256)])
+def test_what_shows_the_picture_is_where_it_is_drawn(shape):
+    """Of a white picture all that is not black, whoever fits it in; and how much of every patch."""
+    white, size, grid = np.full((*shape, 3), 255, np.uint8), (224, 224), PatchGrid(16, 16, 224, 224)
+    drawn = {
+        "openpi": (resize_with_pad(white, 224), 0.5),
+        "lerobot": (lerobot_pictures(white, 224)[0], 0.5),
+        "pad": (model_picture(white, "front", size, "pad")[0], 0.5),
+        "pad_left_top": (model_picture(white, "front", size, "pad_left_top")[0], 1.0),
+    }
+    for who, (picture, towards) in drawn.items():
+        seen = picture.any(axis=2)
+        part = fitted_part(shape, size, towards)
+        expected = np.zeros(size, dtype=bool)
+        top, left, height, width = (round(224 * side) for side in part)
+        expected[top : top + height, left : left + width] = True
+        np.testing.assert_array_equal(seen, expected, err_msg=who)
+        patches = seen.reshape(16, 14, 16, 14).mean(axis=(1, 3)).ravel()
+        np.testing.assert_allclose(grid.shown(part), patches, atol=1e-9, err_msg=who)
 
 
 def states(inputs):
