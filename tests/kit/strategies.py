@@ -49,8 +49,11 @@ def layouts(draw: st.DrawFn) -> SiteLayout:
 
 
 @st.composite
-def episode_tokens(draw: st.DrawFn) -> EpisodeTokens:
-    """Tokens of an episode: a masked camera perhaps, prompts that may change between replans, objects on patches."""
+def episode_tokens(draw: st.DrawFn, fitted: bool = False) -> EpisodeTokens:
+    """Tokens of an episode: a masked camera perhaps, prompts that may change between replans, objects on patches.
+
+    fitted: pictures may have a border.
+    """
     layout = draw(layouts())
     replans = draw(st.integers(1, 4))
     choices = [draw(prompts_for(layout)) for _ in range(draw(st.integers(1, min(2, replans))))]
@@ -65,6 +68,8 @@ def episode_tokens(draw: st.DrawFn) -> EpisodeTokens:
             share = np.random.default_rng(seed).dirichlet(np.full(len(objects), 0.4), size=(replans, patches))
             coverage[camera] = share.astype(np.float32)
     tokens = tokens_of(layout, prompts, objects, coverage, masked)
+    if not fitted:
+        return tokens
     shown = {camera: part for camera in coverage if (part := draw(st.sampled_from(SHOWN))) is not None}
     roles = np.stack([with_borders(layout, of_replan, shown) for of_replan in tokens.key_role])
     return replace(tokens, key_role=roles, border=borders(layout, shown))

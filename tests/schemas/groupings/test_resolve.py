@@ -131,7 +131,7 @@ def test_regions_outside_the_layout_are_errors(tokens, selector):
 @pytest.mark.parametrize("name", BUILTIN_GROUPINGS)
 @given(data=st.data())
 def test_builtin_groupings_take_every_key_exactly_once(name, data):
-    tokens = data.draw(episode_tokens())
+    tokens = data.draw(episode_tokens(fitted=True))
     grouping = BUILTIN_GROUPINGS[name](collect_vocabulary([tokens]))
     check_names(grouping, collect_vocabulary([tokens]))
     total = resolve(grouping, tokens).weights.sum(axis=2)
@@ -140,7 +140,7 @@ def test_builtin_groupings_take_every_key_exactly_once(name, data):
 
 @given(data=st.data())
 def test_masses_of_a_complete_disjoint_grouping_sum_to_the_row_sum(data):
-    tokens = data.draw(episode_tokens())
+    tokens = data.draw(episode_tokens(fitted=True))
     grouping = data.draw(groupings(tokens))
     rows = random_rows(tokens, (2, 3), data.draw(st.integers(0, 2**16)))
     resolved = resolve(grouping, tokens)
@@ -152,7 +152,7 @@ def test_masses_of_a_complete_disjoint_grouping_sum_to_the_row_sum(data):
 
 @given(data=st.data())
 def test_masses_of_segments_are_those_of_rows(data):
-    tokens = data.draw(episode_tokens())
+    tokens = data.draw(episode_tokens(fitted=True))
     grouping = data.draw(groupings(tokens))
     rows = random_rows(tokens, (2,), data.draw(st.integers(0, 2**16)))
     resolved = resolve(grouping, tokens)
@@ -173,7 +173,7 @@ def test_masses_of_segments_are_those_of_rows(data):
 
 @given(data=st.data())
 def test_union_and_difference_partition(data):
-    tokens = data.draw(episode_tokens())
+    tokens = data.draw(episode_tokens(fitted=True))
     a, b = (data.draw(groupings(tokens)).groups["g0"][0] for _ in range(2))
     union, only_a, only_b, both = (
         weights(tokens, text) for text in (f"({a}) | ({b})", f"({a}) - ({b})", f"({b}) - ({a})", f"({a}) & ({b})")
@@ -231,7 +231,7 @@ def test_reference_on_latent_frames_and_where_it_makes_no_sense():
 @given(data=st.data())
 def test_what_shows_no_picture_is_no_picture(data):
     """Pictures, border and masked patches share all keys of cameras, a patch by what of it shows a picture."""
-    tokens = data.draw(episode_tokens())
+    tokens = data.draw(episode_tokens(fitted=True))
     image, border = (weights(tokens, f"role:{role}") for role in ("image", "border"))
     seen = np.isin(tokens.static_roles, [Role.IMAGE, Role.BORDER])
     rest = np.zeros(tokens.layout.num_keys) if tokens.border is None else tokens.border
