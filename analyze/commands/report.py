@@ -9,7 +9,7 @@ from typing import Any
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.result import Result
-from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.question import KnownEpisodes, Question
 from vla_attention.analyze.registry import COMMANDS
 from vla_attention.schemas.errors import UserError
 
@@ -61,13 +61,14 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
 
 def _answers(question: Question, own: Mapping[str, Mapping[str, Any]]) -> Iterator[Result]:
     bare = replace(question.settings, grouping=None, groups=(), ratio=None)
+    known: KnownEpisodes = {}  # tokens are read once for all of them
     names = [name for name in QUESTIONS if name in COMMANDS and not COMMANDS[name].folder]
     for name in names:
         settings = question.settings if name in _OF_GROUPS else bare
         try:
-            yield answer_to(name, question.stores, settings, own.get(name))
+            yield answer_to(name, question.stores, settings, own.get(name), known)
         except UserError as error:
             title = COMMANDS[name].answers
             yield Result(f"{title[0].upper()}{title[1:]}", about(question), [], [], notes=[str(error)])
-    held = answer_to("analyze", question.stores, question.settings, {"list": True})
+    held = answer_to("analyze", question.stores, question.settings, {"list": True}, known)
     yield replace(held, title="What was run", findings=(), tables=held.tables[:1], whole=False)
