@@ -111,7 +111,8 @@ class EpisodeEffects(Document, frozen=True):
     Entry i of these arrays is of replan `replan[i]` under `conditions[condition[i]]`, which is of the item at the same
     place of `items`. A replan without an entry of a condition was not measured under it: the word is not in its prompt,
     the object is out of view, the replan was skipped, or its calls were refused. `units`: how far a change of 1 moves
-    the robot, by dimension of the action.
+    the robot, by dimension of the action. `silent_blocks`: modules of a hybrid policy that ran without an attention
+    call (linear attention, state spaces): keys were cut off in the others only, whoever the reader is.
     """
 
     conditions: tuple[Interventions, ...]
@@ -119,6 +120,7 @@ class EpisodeEffects(Document, frozen=True):
     units: tuple[Number, ...]
     replan: tuple[int, ...]
     condition: tuple[int, ...]
+    silent_blocks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that each condition has its item."""

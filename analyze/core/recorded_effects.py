@@ -37,7 +37,7 @@ from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.effects import CHANGE, EffectItem
-from vla_attention.schemas.errors import BadArgument, UnknownName, plural
+from vla_attention.schemas.errors import BadArgument, UnknownName, listing, plural
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
 from vla_attention.schemas.groupings.selectors import SelectorError
@@ -201,7 +201,13 @@ def recorded_effects(
         for at, selectors in places
         if at.site != question.site
     ]
-    found = RecordedEffects(question, units, episodes, (*units.notes, *drift, *elsewhere))
+    silent = {block for item in having for block in getattr(item.episode.attributes.effects, "silent_blocks", ())}
+    hybrid = (
+        f"Through softmax only, also where nobody reads it: keys are not cut off in {plural(len(silent), 'block')} "
+        f"without softmax attention ({listing(sorted(silent), 3)}). Exchanges of words and pictures are whole."
+    )
+    notes = (*units.notes, *[hybrid] * bool(silent), *drift, *elsewhere)
+    found = RecordedEffects(question, units, episodes, notes)
     if found.rows().head(1).collect().is_empty():
         said = drift or ("None was measured in a selected replan.",)
         raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, " ".join(said)))

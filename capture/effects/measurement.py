@@ -75,6 +75,8 @@ class EffectMeasurement:
     no_pictures: str = (
         "Cameras' pictures are exchanged for grey ones; --effects-pictures STORE takes the task's mean ones."
     )
+    #: See `EpisodeEffects`; None before it was looked at.
+    silent_blocks: tuple[str, ...] | None = field(default=None, init=False)
     #: Replans whose effects were refused.
     refused: int = field(default=0, init=False)
     #: What each replan with effects took.
@@ -273,7 +275,8 @@ class EpisodeEffectsMeasured:
         )
         self.run.seconds.append(time.perf_counter() - begun)
         units = tuple(float(unit) for unit in self.run.units)
-        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights)
+        silent = self.run.silent_blocks or ()
+        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent)
 
     def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
         pictures = self.run.pictures

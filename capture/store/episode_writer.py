@@ -264,6 +264,7 @@ class EpisodeWriter:
                 measured[0][1].units,
                 tuple(replan for replan, of in measured for _ in of.measured),
                 tuple(number for _, of in measured for number in of.measured),
+                measured[0][1].silent_blocks,
             ),
             steps=None if steps is None else steps.attributes,
             plumbing=next((record.plumbing for record in records if record.plumbing is not None), None),

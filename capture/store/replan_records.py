@@ -54,6 +54,7 @@ class ReplanEffects:
     conditions, items: of the episode, the same at all its replans. units: see `EpisodeEffects`. measured: the numbers
     of the conditions that were measured, ascending. change: (measured, horizon, action dim) float32, actions under the
     condition minus actions, in `units`. cut: site -> (measured, key) float32, the weights of the keys that were cut.
+    silent_blocks: see `EpisodeEffects`.
     """
 
     conditions: tuple[Interventions, ...]
@@ -62,6 +63,7 @@ class ReplanEffects:
     measured: tuple[int, ...]
     change: NDArray[np.float32]
     cut: Mapping[str, NDArray[np.float32]]
+    silent_blocks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -167,8 +168,9 @@ class AttentionCall:
         if bool(wrong.any()):
             return (
                 f"sum to {float(sums[wrong][0]):.4g} and not to 1 when they are multiplied with the values: the module "
-                "changes them after the softmax, as dropout (call policy.eval()), factors and sinks without a key do "
-                "(load the model without them). Such rows cannot be stored"
+                "changes them after the softmax, as dropout (call policy.eval()) and factors do, or its softmax has "
+                "keys without values (trained sinks: name them in the layout, va.RecordedSite(sinks=...)). Such rows "
+                "cannot be stored"
             )
         return ""
 
@@ -181,10 +183,15 @@ def refuse_rows(shape: CallShape, why: str) -> None:
 class Watcher:
     """Is told about every attention call of a watched block, in order. This one takes and changes nothing.
 
-    changes: whether it is asked for changes at all.
+    changes: whether it is asked for changes at all. modules: the ids of the policy's modules that ran.
     """
 
     changes: Any = False
+
+    @cached_property
+    def modules(self) -> set[int]:
+        """See above."""
+        return set()
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return logits to add before the softmax, broadcastable to (batch, head, query, key), or None for no change.
@@ -195,6 +202,10 @@ class Watcher:
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call whose kernel has run is not wanted: nothing is made of its tensors then."""
         return False
+
+    def sinks(self, shape: CallShape) -> int:
+        """Return how many keys of a softmax, the last ones, have no values."""
+        return 0
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Take what is wanted of a call, right after its kernel; in order. Return whether its output is followed."""

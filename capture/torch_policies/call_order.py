@@ -172,6 +172,11 @@ class CallOrder(Watcher):
         self._count(shape, place)
         return True
 
+    def sinks(self, shape: CallShape) -> int:
+        """See `Watcher`."""
+        place = self.place(shape)
+        return 0 if place is None or place.site is None else self.known.sites[place.site].sinks
+
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """See `Watcher`."""
         place = self.place(call.shape)

@@ -14,6 +14,7 @@ from torch import Tensor
 from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape, Watcher
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
+from vla_attention.capture.torch_policies.policy_modules import blocks_without_calls, find_policy
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument
@@ -80,12 +81,14 @@ class CallTable:
         calls: the shapes, in order.
         errors: of rows times values, one for every call; empty where they were not looked at, and then not shown.
         refused: for every call why recording refuses it, see `CallRow`; empty where it was not looked at.
+        silent: paths of repeated blocks that ran and made no call, where others like them did.
     """
 
     policy: str
     calls: tuple[CallShape, ...]
     errors: tuple[float, ...] = ()
     refused: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
 
     @property
     def rows(self) -> tuple[CallRow, ...]:
@@ -118,6 +121,11 @@ class CallTable:
         lines += [f"Recording refuses {pattern}, {sizes}: {refused}." for (pattern, _, sizes, *_), refused in cells]
         if cells:
             lines.append("Calls that hold no action queries are left out by a rule without a site.")
+        if self.silent:
+            lines.append(
+                f"Ran without an attention call: {folded_paths(self.silent)} (linear attention, state spaces, "
+                "convolutions). What keys give through these is neither recorded nor cut off by a knockout."
+            )
         batch = sorted({call.batch for call in self.calls})
         if batch and batch[0] > 1 and self.errors:
             lines.append(_BATCH)
@@ -191,7 +199,11 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
         with watch_attention(policy, alone):
             first_row()
         _compare_first_rows(shapes, alone)
-    return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors), tuple(shapes.refused))
+    found = find_policy(policy)
+    silent = blocks_without_calls(found.modules, shapes.modules, [call.module for call in shapes.calls])
+    return CallTable(
+        type(found.policy).__name__, tuple(shapes.calls), tuple(shapes.errors), tuple(shapes.refused), tuple(silent)
+    )
 
 
 def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:

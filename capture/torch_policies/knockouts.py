@@ -105,14 +105,16 @@ class CallBias:
         sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
         call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
         if call not in self._known:
+            count = shape.keys - (self.layout.site(place.site).sinks if place.site else 0)
             if place.site is None:
                 keys = CallKeys.of_prefix(self._tokens(rule.tokens or "", shape))
             else:
                 # The keys of the call's own queries are the last ones, of a site that has keys of actions.
                 has_actions = any(span.kind == "action" for span in self.layout.site(place.site).keys.spans)
-                own = slice(shape.keys - shape.queries, shape.keys) if has_actions else None
-                keys = CallKeys(place.queries, own if shape.keys >= shape.queries else None, place.keys)
-            self._known[call] = logit_bias(edits, (shape.heads, shape.queries, shape.keys), keys)
+                own = slice(count - shape.queries, count) if has_actions else None
+                keys = CallKeys(place.queries, own if count >= shape.queries else None, place.keys)
+            bias = self._known[call] = logit_bias(edits, (shape.heads, shape.queries, shape.keys), keys)
+            bias[..., count:] = 0
         return self._known[call]
 
     def _tokens(self, site: str, shape: CallShape) -> NDArray[np.int64]:

@@ -46,6 +46,10 @@ _QUOTIENTS = {"div", "truediv", "itruediv", "true_divide"}
 _JOINS = {"cat", "concat", "stack", "sum", "mean", "neg"}
 #: Functions that multiply every number with a factor of its own: a norm, or a dropout.
 _SCALES = {"rms_norm", "dropout"}
+#: Functions that write one tensor into another.
+_WRITES = {"setitem", "copy", "index_copy", "index_put", "slice_scatter", "select_scatter", "scatter", "masked_scatter"}
+#: Norms, behind which the stream goes on where they stand after the sum.
+_NORMS = {"rms_norm", "layer_norm", "group_norm", "instance_norm", "batch_norm", "normalize"}
 
 
 #: Functions whose result has numbers of their first argument only, or none of what they are given.
@@ -92,6 +96,9 @@ class OutputWay:
         mixes_rows: whether what one row of the batch gave is added to others.
         found: whether the residual stream is known; it is the last of `taken` then.
         changed: what was done to it first that is not linear, as "module 'x' computes tanh of".
+        carried, bent: the numbers of the sums that reached another sum as they are or behind a norm, and by a function
+            that is not linear, as a gate does. A sum that is bent alone is not the stream. left: whether the stream has
+            left the network, and what follows is of the next denoise step.
         dtypes: of all that is followed.
     """
 
@@ -102,7 +109,15 @@ class OutputWay:
     mixes_rows: bool = field(default=False, init=False)
     found: bool = field(default=False, init=False)
     changed: str = field(default="", init=False)
+    carried: set[int] = field(default_factory=set, init=False)
+    bent: set[int] = field(default_factory=set, init=False)
+    left: bool = field(default=False, init=False)
     dtypes: set[torch.dtype] = field(default_factory=set, init=False)
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the last sum reached others by functions alone that are not linear."""
+        return len(self.taken) in self.bent - self.carried
 
     def result(self) -> Any:
         """Return what was kept of the sum that is the residual stream; None, and `lost` says why, where none is."""
@@ -116,6 +131,8 @@ class OutputWay:
         last = self.taken[-1]
         if not self.found and (last.computed or len(last.sums) < len(self.taken) - 1):
             self.lost = "what the attention gave is added to several tensors, none of which shows to be the stream"
+        elif not self.found and self.is_bent:
+            self.lost = "a sum with what the attention gave reaches others by functions alone that are not linear"
         return None if self.lost else last.kept
 
 
@@ -140,6 +157,7 @@ class _Step:
         is_sum: whether it is the last of them, and not something computed of it.
         projected: whether a matrix product stands on its way, from the last sum on.
         factor: whether it is made of numbers such as those by which a norm divides.
+        goes_on: whether it is the last of the sums behind norms, or written into another tensor.
     """
 
     replay: Replay | None
@@ -147,6 +165,7 @@ class _Step:
     is_sum: bool = False
     projected: bool = False
     factor: bool = False
+    goes_on: bool = False
 
 
 _Steps = Sequence[tuple[Tensor, _Step]]
@@ -214,7 +233,8 @@ class OutputWays:
             factor = all(step.factor for _, step in steps) or _is_norm(call.name, steps, results)
             if not way.changed and any(step.replay is not None for _, step in steps) and not factor:
                 way.changed = f"{self._running()} computes {call.name} of"
-            self._put(results, way, _Step(None, sums, projected=projected, factor=factor))
+            goes_on = _goes_on(call, steps)
+            self._put(results, way, _Step(None, sums, goes_on=goes_on, projected=projected, factor=factor))
 
     def _add(self, way: OutputWay, call: _Call, steps: _Steps, result: Tensor) -> None:
         """Note a sum, which may be the residual stream."""
@@ -233,18 +253,25 @@ class OutputWays:
             self._put([result], way, _Step(None, sums, projected=projected, factor=factor))
         elif streams and any(streams[0].sums[-1] in step.sums for step in rest):
             self._find(way, streams[0].sums[-1])
-        elif nonlinear and (
-            ((streams or others) and any(step.replay is None for step in beside))
-            or (sums and any(step.replay is not None for step in beside))
-        ):
+        elif nonlinear and (streams or (sums and beside) or (others and any(step.replay is None for step in beside))):
             self._lose(way)
-        elif len(nonlinear) > 1 and sums:
+        elif (
+            len(nonlinear) > 1
+            and sums
+            and (sums[-1] in way.carried or (way.left and not way.is_bent) or any(step.goes_on for step in nonlinear))
+        ):
             self._find(way, sums[-1])
         elif nonlinear and others and projected and not self._left(way, sums, result):
             self._lose(way, "adds something else that is computed of a sum with")
         elif nonlinear:
             of_all = () if any(not step.sums for _, step in steps) else sums
-            self._put([result], way, _Step(None, of_all, projected=projected))
+            way.left = way.left or (bool(sums) and self._left(way, sums, result))
+            if not way.left:
+                carried = [step for step in rest if step.sums and (step.replay is not None or step.goes_on)]
+                way.carried.update(step.sums[-1] for step in carried)
+                way.bent.update(number for step in nonlinear for number in step.sums)
+            goes_on = len(rest) == 1 and rest[0].goes_on
+            self._put([result], way, _Step(None, of_all, goes_on=goes_on, projected=projected))
         elif (others and not streams) or (streams and rest):
             self._sum(way, call, steps, result)
         else:
@@ -317,7 +344,7 @@ class OutputWays:
             return
         way.found, way.take = True, None
         del way.taken[number:]
-        self._change(way, lambda step: None if step.sums or step.factor else _Step(None))
+        self._change(way, lambda step: None if number in step.sums or step.factor else _Step(None))
 
     def _lose(self, way: OutputWay, what: str = "") -> None:
         """Note why it is not known what is added: what the running module does, or what it did before."""
@@ -370,7 +397,8 @@ class _Call:
         divided = self.name in _QUOTIENTS and id(self.args[0]) in linear and not self.kwargs.get("rounding_mode")
         if self.name in _SCALES and single and step.replay is not None:
             return _scaled(step.replay, (self.result.float() / tensor.float()).nan_to_num())
-        product = single and (self.name in _PRODUCTS or divided)
+        once = sum(step.replay is not None for _, step in steps) == 1  # a square is not linear
+        product = single and once and (self.name in _PRODUCTS or divided)
         if not product and (factors or self.name not in _COPIES | _FOLDS | _SUMS | _JOINS):
             return None
         if self.name in _COPIES:
@@ -399,7 +427,17 @@ def _is_norm(name: str, steps: _Steps, results: Sequence[Tensor]) -> bool:
     """Whether of the numbers on the last axis of a tensor one is made: by this a norm divides."""
     shape = steps[0][0].shape
     norms = (*shape[:-1], 1), tuple(shape[:-1])
-    return name not in _MATRIX_PRODUCTS and all(tuple(result.shape) in norms for result in results)
+    several = len(shape) > 0 and shape[-1] > 1
+    return several and name not in _MATRIX_PRODUCTS and all(tuple(result.shape) in norms for result in results)
+
+
+def _goes_on(call: _Call, steps: _Steps) -> bool:
+    """Whether a result is a sum behind a norm, scaled by a weight for each channel, or written somewhere."""
+    kept = _COPIES | _FOLDS | _SCALES | {"mul", "rmul", "imul"}
+    used = used_tensors(call.name, call.args, call.kwargs)
+    weighs = sum(tensor.numel() == steps[0][0].numel() for tensor in used) == 1
+    norm = call.name in _NORMS | _WRITES and all(step.is_sum or step.goes_on for _, step in steps)
+    return norm or (call.name in kept and weighs and all(step.goes_on for _, step in steps))
 
 
 @dataclass(frozen=True)

@@ -116,12 +116,15 @@ class RecordedSite(Document, frozen=True):
             see become `masked_image` in image spans, `padding` in text, and `absent` in others.
         variable_span: the span that may have fewer keys in a call than in `keys` (a prompt without padding). Its keys
             come first in the span, the rest is absent at this replan.
+        sinks: how many keys more its softmax has than there are values (trained sinks, as gpt-oss): they are the last
+            ones of `keys`, in spans of the kind state with the role learned. A knockout leaves them.
     """
 
     keys: SiteLayout
     action_queries: tuple[int, int | None]
     role_of_span: dict[str, str]
     variable_span: str | None = None
+    sinks: int = 0
 
     def __post_init__(self) -> None:
         """Check the names of spans and roles."""
@@ -137,6 +140,14 @@ class RecordedSite(Document, frozen=True):
         start, stop = self.action_queries
         if stop is not None and (start < 0) == (stop < 0) and stop <= start:
             raise BadArgument(f"Site '{self.name}' has the action queries {start}..{stop}, which are none.")
+        first_sink = self.keys.num_keys - self.sinks
+        wrong = [span.name for span in self.keys.spans if span.stop > first_sink and self.role_of(span) != Role.LEARNED]
+        within = any(span.start < first_sink < span.stop for span in self.keys.spans)
+        if not 0 <= self.sinks < self.keys.num_keys or (self.sinks and (wrong or within)):
+            raise BadArgument(
+                f"Site '{self.name}' has {self.sinks} sinks; expected the last keys, in spans of their own of the kind "
+                f"state with the role learned. Its spans: {listing(f'{s.name} {s.num_keys}' for s in self.keys.spans)}."
+            )
 
     def _check_role(self, span: Span) -> None:
         """Raise an error unless the span's kind and the role that is given for its keys exist and fit together."""
@@ -223,6 +234,9 @@ class PromptText(Document, frozen=True):
         skip_first: number of ids before the first that has a key (placeholders that the policy replaced by another id).
         site: the site whose spans these are; None for every site that has them, at the same keys.
         state_between: texts around the state, where a policy writes its numbers into the prompt, after the instruction.
+        generated: the spans of tokens that the policy writes itself before it acts (a subtask), in their order. Their
+            ids are those that the embedding is given after the prompt's, in calls of fewer tokens, or behind them. They
+            keep the role of their span.
     """
 
     spans: tuple[str, ...]
@@ -231,6 +245,7 @@ class PromptText(Document, frozen=True):
     skip_first: int = 0
     site: str | None = None
     state_between: tuple[str, str] | None = None
+    generated: tuple[str, ...] = ()
 
 
 class PolicyLayout(Document, frozen=True):
@@ -322,7 +337,7 @@ class PolicyLayout(Document, frozen=True):
                 yield f"the camera '{camera.name}' has no span in any site (cameras there: {listing(sorted(pictured))})"
         if self.text is not None:
             for site in self.text_sites:
-                for span in self.text.spans:
+                for span in (*self.text.spans, *self.text.generated):
                     if span not in [known.name for known in site.keys.spans]:
                         yield f"the prompt's span '{span}' is not in site '{site.name}'"
             if not self.text_sites:

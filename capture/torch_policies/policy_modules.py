@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -146,3 +147,26 @@ def root_modules(policy: object) -> dict[str, nn.Module]:
             roots[path] = module
             inside.update(id(part) for part in module.modules())
     return roots
+
+
+def blocks_without_calls(modules: Mapping[str, nn.Module], ran: Collection[int], calls: Iterable[str]) -> list[str]:
+    """Return the paths of repeated blocks that ran and made no attention call, where others of their list made some.
+
+    modules: by path. ran: the ids of those that ran. calls: the paths of modules that made attention calls.
+    """
+    paths, found, lists = set(calls), [], list[str]()
+    for path, module in modules.items():
+        if not isinstance(module, nn.ModuleList) or any(path.startswith(f"{outer}.") for outer in lists):
+            continue
+        blocks = {_joined(path, name): block for name, block in module.named_children()}
+        calling = {block for block in blocks if any(f"{call}.".startswith(f"{block}.") for call in paths)}
+        if not calling:
+            continue
+        lists.append(path)
+        kinds = Counter(type(block) for block in blocks.values())
+        found += [
+            name
+            for name, block in blocks.items()
+            if name not in calling and kinds[type(block)] > 1 and any(id(part) in ran for part in block.modules())
+        ]
+    return found

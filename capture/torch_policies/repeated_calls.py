@@ -28,9 +28,10 @@ from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
+from vla_attention.capture.torch_policies.inspect_calls import folded_paths
 from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
+from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, blocks_without_calls
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.capture.torch_policies.watch import watch_attention
@@ -254,6 +255,7 @@ class RepeatedPolicy:
                 "in it, as lambda call: (policy.reset(), policy.select_action(batch))[1]."
             )
         watcher.check(f"the repeated call of {call.where}")
+        self._look_for_silent_blocks(watcher)
         self._check_prefix(watcher, [edit for of_site in edits.values() for edit in of_site])
         actions = read_actions(result)
         if actions is None or actions.shape != call.actions.shape:
@@ -263,6 +265,20 @@ class RepeatedPolicy:
                 "as replan.actions is set to."
             )
         return actions, watcher.seen
+
+    def _look_for_silent_blocks(self, watcher: RepeatWatcher) -> None:
+        """Say once which repeated blocks no knockout reaches: an effect for all queries is not the total one then."""
+        if self.measurement.silent_blocks is not None:
+            return
+        called = [shape.module for shape in watcher.ran]
+        silent = self.measurement.silent_blocks = tuple(
+            blocks_without_calls(self._found.modules, watcher.modules, called)
+        )
+        if silent:
+            self.measurement.say_once(
+                f"{folded_paths(silent)} ran without an attention call (linear attention, state spaces): keys are cut "
+                "off through softmax only, also for all queries. Exchange words and pictures for whole effects."
+            )
 
     def _check_prefix(self, watcher: RepeatWatcher, edits: Sequence[SiteEdit]) -> None:
         """Raise `ChangeRefused` if edits of the prefix's queries reached no call."""

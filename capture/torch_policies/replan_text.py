@@ -53,6 +53,8 @@ class PromptIds:
 
     def __init__(self, embeddings: Mapping[str, nn.Module], batch: int) -> None:
         self.ids: NDArray[np.int64] | None = None
+        #: The same of what it was given afterwards: the tokens that the policy wrote.
+        self.written: list[Tensor] = []
         self._embeddings = embeddings
         self._batch = batch
         #: Path -> the shape of the largest whole numbers that the module was given.
@@ -74,8 +76,12 @@ class PromptIds:
         self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
         rows = given[None] if given.ndim == 1 else given
         is_prompt = path == next(iter(self._embeddings)) and rows.ndim == 2 and len(rows) == self._batch
-        if is_prompt and (self.ids is None or rows.shape[1] > self.ids.shape[1]):
-            self.ids = rows.detach().cpu().numpy().astype(np.int64)
+        if not is_prompt:
+            return
+        if self.ids is None or rows.shape[1] > self.ids.shape[1]:
+            self.ids, self.written = rows.detach().cpu().numpy().astype(np.int64), []
+        else:
+            self.written.append(rows.detach().clone())
 
     def missing(self) -> PromptDoesNotFit:
         """Return the error for a call in which the prompt's embedding was given no ids: it says which others were."""
@@ -135,8 +141,13 @@ class ReplanText:
         if isinstance(given.prompt, Prompt):
             return given.prompt
         kept: list[tuple[Any, int]]
+        if given.prompt is not None and not sites:
+            raise PromptDoesNotFit(
+                f"replan(prompt=...) was given {len(given.prompt)} pieces, and the layout '{self.layout.name}' does "
+                "not say which keys they are: give it text=va.PromptText(spans, embedding), or leave the prompt out."
+            )
         if sites and given.prompt is not None:
-            keys = self._keys(len(given.prompt))
+            keys = self._keys_of_tokens(len(given.prompt), 0)
             if len(keys) != len(given.prompt):
                 raise PromptDoesNotFit(
                     f"The prompt was given as {len(given.prompt)} pieces, and the layout's prompt has {len(keys)} "
@@ -148,12 +159,15 @@ class ReplanText:
         elif sites and self.tokenizer is not None:
             if self.seen.ids is None:
                 raise self.seen.missing()
-            ids = self._text_ids(row)
-            keys = self._keys(len(ids))
+            ids, written = self._text_ids(row), self._written_ids(row)
+            keys = self._keys_of_tokens(len(ids), len(written))
+            ids += written
             if len(ids) != len(keys):
                 raise PromptDoesNotFit(
-                    f"The policy embedded {len(ids)} text tokens, and the layout's prompt has {len(keys)} keys: change "
-                    "its spans, or its skip_ids (placeholders for patches)."
+                    f"The policy embedded {len(ids) - len(written)} text tokens, and {len(written)} more behind them; "
+                    f"the layout's prompt has {len(keys)} keys: change its spans, or its skip_ids (placeholders for "
+                    "patches). Where the policy writes tokens itself before it acts, as a subtask, give them a span "
+                    "named in PromptText.generated; else give the text with replan(prompt=...)."
                 )
             # The prompt has the same keys at every site.
             seen = [valid[site.name] for site in sites if site.name in valid]
@@ -167,6 +181,20 @@ class ReplanText:
             return Prompt(given.instruction, (), (0, len(given.instruction)))
         pieces = tuple(Piece(key, text[a:b], a, b) for (_, key), (a, b) in zip(kept, ranges, strict=True))
         return Prompt(text, pieces, find_instruction(text, given.instruction))
+
+    def _keys_of_tokens(self, count: int, num_written: int) -> list[int]:
+        """Return the keys of the prompt's tokens, and behind them those of the tokens that the policy wrote.
+
+        count, num_written: their numbers. A policy may embed both again, in one call.
+        """
+        assert self.layout.text is not None
+        keys = self._keys(count)
+        if not self.layout.text.generated:
+            return keys
+        site = self.layout.text_sites[0]
+        present = self.present.get(site.name)
+        generated = [key for key in _keys_of(site, self.layout.text.generated) if present is None or present[key]]
+        return keys + generated if num_written or count > len(keys) else keys
 
     def _keys(self, count: int) -> list[int]:
         """Return the keys of the prompt's tokens, the same at every site that has them; count: number of tokens."""
@@ -217,6 +245,8 @@ class ReplanText:
         roles[[key for key in keys if roles[key] == Role.INSTRUCTION]] = Role.TEMPLATE
         first, last = prompt.instruction
         for piece in prompt.pieces:
+            if piece.key not in keys:  # written by the policy
+                continue
             roles[piece.key] = Role.INSTRUCTION if piece.start < last and piece.stop > first else Role.TEMPLATE
         for piece in state_pieces(prompt, self.layout.text.state_between) if self.layout.text.state_between else ():
             roles[piece.key] = Role.STATE
@@ -273,6 +303,12 @@ class ReplanText:
             return []
         skipped = set(self.layout.text.skip_ids)
         return [token for token in self.seen.ids[row, self.layout.text.skip_first :].tolist() if token not in skipped]
+
+    def _written_ids(self, row: int) -> list[int]:
+        """The ids of the tokens that the policy wrote itself; none where the layout has no spans for them."""
+        if self.layout.text is None or not self.layout.text.generated:
+            return []
+        return [token for ids in self.seen.written for token in ids[row].tolist()]
 
     @property
     def spans(self) -> tuple[str, ...]:

@@ -198,7 +198,11 @@ class Softmaxes:
         if softmax.shape in self.changed:
             self.changed.remove(softmax.shape)
         multiplied = given.detach().permute(product.rows)
-        sizes, keys, dim = _sizes(softmax, product, given), multiplied.shape[-1], value.shape[product.values[-1]]
+        sizes, count, dim = _sizes(softmax, product, given), multiplied.shape[-1], value.shape[product.values[-1]]
+        sinks = softmax.logits.shape[-1] - count
+        if not sinks or given.shape[:-1] != softmax.logits.shape[:-1] or self._mode.sinks(softmax.shape) != sinks:
+            sinks = 0
+        keys = count + sinks
         kv_heads = math.prod(multiplied.shape[: product.num_lead_of_values]) // sizes[0]
         before = softmax.shape
         shape = replace(
@@ -227,10 +231,15 @@ class Softmaxes:
         if self._mode.passes(shape):
             return
         with exact():
-            rows, allowed, unknown = _decided(multiplied, softmax, given, product, (*sizes, keys))
+            rows, allowed, unknown = _decided(multiplied, softmax, given, product, (*sizes, count))
             seen = rows.new_ones((), dtype=torch.bool).expand(sizes[0], 1, sizes[2], keys)
+            values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, count, dim)
+            if sinks:
+                left = normalised(_wide(softmax.logits))[..., count:].permute(product.rows)
+                rows = torch.cat([rows, left.reshape(*sizes, sinks)], dim=-1)
+                values = nn.functional.pad(values, (0, 0, 0, sinks))
+                allowed = None if allowed is None else nn.functional.pad(allowed, (0, sinks), value=True)
             seen = seen if allowed is None else allowed
-            values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, keys, dim)
         back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
         self._products.put(result, _Made(shape, product.output.index(len(product.rows) - 2)))
         self._mode.saw(
@@ -292,8 +301,13 @@ def _is_changed(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product
     Cut cells are 0, and the others what the softmax gives of its logits without them. Where something else than what
     the softmax gave is multiplied, that is looked at for cut cells; factors must be the same in any order of the axes.
     """
-    shape = softmax.shape
+    shape, count = softmax.shape, rows.shape[-1]
     with exact():
+        if softmax.before.shape[-1] > count:  # sinks are cut off behind the softmax
+            before = softmax.before.permute(product.rows)
+            changed = before.reshape(shape.batch, shape.heads, shape.queries, -1) + change.to(before.dtype)
+            wanted = normalised(_wide(changed))[..., :count].reshape(rows.shape)
+            return _are_equal(rows, wanted, _rounding(rows, softmax))
         for arrange in _arrangements(softmax.before, given):
             before = arrange(softmax.before).permute(product.rows)
             changed = before.reshape(shape.batch, shape.heads, shape.queries, -1) + change.to(before.dtype)

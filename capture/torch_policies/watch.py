@@ -175,6 +175,11 @@ class AttentionMode(TorchFunctionMode):
         self.number += passed
         return passed
 
+    def sinks(self, shape: CallShape) -> int:
+        """Ask the watcher how many keys of a softmax have no values."""
+        with self._failing():
+            return self._watcher.sinks(shape)
+
     def saw(self, call: AttentionCall, probabilities: Sequence[Tensor] = ()) -> None:
         """Tell the watcher about a call, and count it; probabilities: tensors that the policy may use once more."""
         with self.computing():
@@ -222,15 +227,17 @@ class AttentionMode(TorchFunctionMode):
 
     @contextmanager
     def noticing_threads(self) -> Iterator[None]:
-        """Notice a module of the policy that runs in another thread, whose functions this mode does not see.
+        """Notice the policy's modules that run, in another thread too, whose functions this mode does not see.
 
         torch's global hooks would make every module slower, and torch.compile warn.
         """
         call = nn.Module.__call__
 
         def noticed(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() != self._thread and id(module) in self._paths:
-                self._ran_elsewhere = True
+            if id(module) in self._paths:
+                self._watcher.modules.add(id(module))
+                if threading.get_ident() != self._thread:
+                    self._ran_elsewhere = True
             return call(module, *args, **kwargs)
 
         nn.Module.__call__ = noticed  # type: ignore[method-assign]

@@ -259,6 +259,19 @@ WAYS: dict[str, Way] = {
         lambda b, c: c.stream + nn.functional.linear(c.mixed.bfloat16(), b.out.weight.bfloat16()).float(),
         lambda b, c, s: projected(b, s),
     ),
+    "norm behind the sum": Way(lambda b, c: b.layer_norm(c.stream + b.out(c.mixed)), lambda b, c, s: projected(b, s)),
+    "norm behind the sum, weighted": Way(
+        lambda b, c: functional.layer_norm(c.stream + b.out(c.mixed), (WIDTH,)) * (1 + chunk(b, c, 1)),
+        lambda b, c, s: projected(b, s),
+    ),
+    "norm by a square": Way(
+        lambda b, c: c.stream + (lambda u: u * torch.rsqrt((u * u).mean(-1, keepdim=True) + 1e-6))(b.out(c.mixed)),
+        lambda b, c, s: projected(b, s) * rms(b.out(c.mixed)),
+    ),
+    "written into a copy": Way(
+        lambda b, c: c.stream.clone().index_copy_(1, torch.arange(ACTIONS), c.stream + b.out(c.mixed)),
+        lambda b, c, s: projected(b, s),
+    ),
     "scaled stream": Way(lambda b, c: 1.5 * c.stream + b.out(c.mixed), lambda b, c, s: projected(b, s)),
     "parallel feed-forward": Way(
         lambda b, c: b.out(c.mixed) + b.mlp(c.normed) + c.stream, lambda b, c, s: projected(b, s)
@@ -391,3 +404,40 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     ),
     "another way behind the feed-forward": (added_behind_the_feed_forward, "adds something else"),
 }
+
+
+def joined(block: Block, call: Call) -> tuple[Tensor, Tensor, Tensor]:
+    """The stream, the projected output, and a sum of layers of both: what a gate is computed of."""
+    update = block.out(call.mixed)
+    return call.stream, update, block.second(update) + block.second(call.stream)
+
+
+def gated(function: Callable[[Tensor, Tensor, Tensor], Tensor]) -> tuple[Add, str]:
+    return lambda b, c: function(*joined(b, c)), ""
+
+
+#: Gates that are computed of the output, by a sum that is not the stream.
+GATES = {
+    "highway": gated(lambda x, y, s: (1 - s.sigmoid()) * x + s.sigmoid() * y),
+    "highway, normed": gated(lambda x, y, s: functional.layer_norm((1 - s.sigmoid()) * x + s.sigmoid() * y, (WIDTH,))),
+    "gated recurrent": gated(lambda x, y, s: (1 - s.sigmoid()) * x + s.sigmoid() * y.tanh()),
+    "norm in the gate": gated(
+        lambda x, y, s: (lambda z: (1 - z) * x + z * y)(functional.layer_norm(s, (WIDTH,)).sigmoid())
+    ),
+    "attention on attention": gated(lambda x, y, s: x + s * (y.roll(1, -1) - x.roll(1, -1)).sigmoid()),
+    "gated linear unit": gated(lambda x, y, s: x + functional.glu(torch.cat([s, y - x], dim=-1))),
+    "gated sum": gated(lambda x, y, s: (x + y) * s.sigmoid()),
+    "sum beside": gated(lambda x, y, s: x + y + s.tanh()),
+    "normed beside": gated(lambda x, y, s: functional.layer_norm(s, (WIDTH,)) + y.tanh()),
+    "modulated": gated(lambda x, y, s: x * (1 + s.tanh()) + (y - x.roll(1, -1))),
+    "before the projection": (
+        lambda b, c: c.stream + c.mixed[..., :WIDTH] * (c.mixed[..., :WIDTH] + c.normed).sigmoid(),
+        "",
+    ),
+    "one gate for all channels": (
+        lambda b, c: (lambda u: c.stream + u * u.mean(-1, keepdim=True).sigmoid())(b.out(c.mixed)),
+        "sigmoid",
+    ),
+    "feed-forward without a stream": (lambda b, c: b.mlp(c.stream + b.out(c.mixed)), ""),
+}
+UNKNOWN |= GATES

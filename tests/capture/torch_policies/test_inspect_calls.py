@@ -44,3 +44,25 @@ def test_a_policy_without_attention():
     policy = nn.Sequential(nn.Linear(3, 3), nn.ReLU())
     with pytest.raises(NoAttention, match="Sequential"):
         va.inspect(policy, lambda: policy(torch.randn(2, 3)))
+
+
+class Recurrent(nn.Module):
+    """Linear attention in place of a block's own."""
+
+    def __init__(self, *sizes: int) -> None:
+        super().__init__()
+        self.mix = nn.Linear(32, 32)
+
+    def forward(self, hidden, memory, mask=None):
+        return self.mix(hidden.exp() @ (memory.exp().mT @ memory))
+
+
+def test_repeated_blocks_that_make_no_call_are_named():
+    policy = Policy(lambda q, k, v, mask: sdpa(q, k, v), layers=5).eval()
+    for number in (1, 2):
+        policy.layers[number] = Recurrent()
+    policy.spare = nn.ModuleList(nn.Linear(32, 32) for _ in range(3))
+    table = va.inspect(policy, lambda: policy(torch.randn(1, 5, 32), torch.randn(1, 7, 32)))
+    assert table.silent == ("layers.1", "layers.2")
+    whole = Decoder().eval()
+    assert not va.inspect(whole, lambda: whole.act(torch.randn(2, 9, 32))).silent

@@ -21,6 +21,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import ContributionsUnknown, WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
@@ -180,13 +181,41 @@ def test_dropout_in_training_mode_is_refused(tmp_path, policy):
         rows_of(tmp_path / "train", policy)
 
 
-def test_sinks_without_a_key_are_refused(tmp_path):
-    def sinks(block, q, k, v):
-        extra = torch.cat([logits(q, k), torch.ones(len(q), HEADS, ACTIONS, 1)], dim=-1)
-        return torch.softmax(extra, dim=-1)[..., :-1] @ v
+def with_sink(block, q, k, v):
+    """As gpt-oss: a trained logit for each head in the softmax, which has no value."""
+    sink = torch.linspace(-1, 1, HEADS).view(1, HEADS, 1, 1).expand(len(q), -1, ACTIONS, 1).to(q.dtype)
+    return torch.softmax(torch.cat([logits(q, k), sink], dim=-1), dim=-1)[..., :-1] @ v
 
+
+def test_sinks_that_the_layout_does_not_name_are_refused(tmp_path):
     with pytest.raises(RowsDoNotMatch, match=r"0\.\d+ "):
-        rows_of(tmp_path, OddPolicy(sinks))
+        rows_of(tmp_path, OddPolicy(with_sink))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize(
+    ("cut", "hidden"),
+    [(None, ()), ("role:state", (4, 5)), (knockout("role:state", keep=True), (0, 1, 2, 3))],
+)
+def test_sinks_are_keys_without_values_that_a_knockout_keeps(tmp_path, dtype, cut, hidden):
+    (joint,) = layout().sites
+    keys = replace(joint.keys, spans=(*joint.keys.spans, Span("sink", "state", KEYS, KEYS + 1)))
+    site = replace(joint, keys=keys, role_of_span={**joint.role_of_span, "sink": "learned"}, sinks=1)
+    policy = OddPolicy(with_sink).to(dtype)
+    own = policy.act()
+    rows, result = rows_of(tmp_path, policy, cut=cut, shape=layout(sites=(site,)))
+    assert torch.equal(result, own) == (cut is None)
+    kept = torch.stack([block.kept[0] for block in policy.blocks])
+    kept[..., list(hidden)] = -math.inf
+    sink = torch.linspace(-1, 1, HEADS).view(1, HEADS, 1, 1).expand(BLOCKS, -1, ACTIONS, 1)
+    wanted = torch.cat([kept, sink], dim=-1).softmax(-1).numpy()
+    np.testing.assert_allclose(rows, wanted, atol=2e-6 if dtype is torch.float32 else 6e-3)
+
+
+def test_sinks_are_the_last_keys_of_a_layout():
+    (joint,) = layout().sites
+    with pytest.raises(BadArgument, match="actions 3"):
+        replace(joint, sinks=1)
 
 
 class GatedBlock(Block):
@@ -209,14 +238,15 @@ def test_a_knockout_does_not_change_a_gate_of_experts(tmp_path, experts):
     policy.blocks = nn.ModuleList(GatedBlock(experts) for _ in range(BLOCKS))
     policy.eval()
     own = policy.act()
-    rows, result = rows_of(tmp_path / "rows", policy)
+    # The stream goes on through the experts alone, so that nobody can say what is added to it.
+    rows, result = rows_of(tmp_path / "rows", policy, contributions=False)
     assert torch.equal(result, own)
     np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
     if experts == KEYS:  # as many experts as keys: nothing tells the two apart before the product
         with pytest.raises(ChangeRefused):
             rows_of(tmp_path / "knockout", policy, cut="role:state")
     else:
-        rows, _ = rows_of(tmp_path / "knockout", policy, cut="role:state")
+        rows, _ = rows_of(tmp_path / "knockout", policy, cut="role:state", contributions=False)
         np.testing.assert_allclose(rows, expected(policy, (4, 5)), atol=2e-6)
 
 
@@ -464,7 +494,8 @@ def test_keys_that_a_slice_cuts_off_in_front(tmp_path):
     np.testing.assert_allclose(rows_of(tmp_path, policy)[0], expected(policy), atol=2e-6)
 
 
-def test_weights_that_change_during_a_run_are_refused(tmp_path):
+@pytest.mark.parametrize("through_data", [False, True])
+def test_weights_that_change_during_a_run_are_refused(tmp_path, through_data):
     policy = OddPolicy(sdpa)
     with record(tmp_path / "a.zarr", policy, layout=layout(), durable=False) as run:
         with run.episode(task_id=0, episode_index=0, instruction="") as episode, episode.replan(env_step=0):
@@ -473,8 +504,11 @@ def test_weights_that_change_during_a_run_are_refused(tmp_path):
             policy.blocks[0].out.weight.copy_(policy.blocks[0].out.weight.clone())  # written, and the same
         with run.episode(task_id=0, episode_index=1, instruction="") as episode, episode.replan(env_step=0):
             policy.act()
-        with torch.no_grad():
-            policy.blocks[0].out.weight.mul_(1.5)
+        if through_data:  # as a moving average does
+            policy.blocks[1].out.weight.data.mul_(0.999)
+        else:
+            with torch.no_grad():
+                policy.blocks[0].out.weight.mul_(1.5)
         with (
             pytest.raises(WeightsChanged),
             run.episode(task_id=0, episode_index=2, instruction="") as episode,

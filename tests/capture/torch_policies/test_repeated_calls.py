@@ -19,8 +19,10 @@ from tests.capture.torch_policies.stateful_policies import (
     SamplingPolicy,
     layout_with_prefix,
 )
+from tests.kit.questions import question_about
 from tests.kit.small_torch_policy import HORIZON, PROMPT, given, small_layout
 from tests.kit.small_torch_variants import PATCHES, TokenPolicy, token_layout
+from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -361,6 +363,34 @@ def test_whether_words_get_through_is_asked_until_an_episode_is_there(tmp_path):
                     raise KeyError
     seen = [episode.attributes.plumbing is not None for episode in open_store(tmp_path / "a.zarr").episodes]
     assert seen == [True, False]
+
+
+class Linear(nn.Module):
+    """Attention without a softmax."""
+
+    def __init__(self, plain):
+        super().__init__()
+        self.qkv, self.out = plain.qkv, plain.out
+
+    def forward(self, tokens, cache, mask):
+        q, k, v = self.qkv(tokens).chunk(3, dim=-1)
+        cache.append(k.mT @ v)
+        return self.out(q @ sum(cache) / len(cache))
+
+
+@pytest.mark.parametrize("hybrid", [False, True])
+def test_blocks_without_softmax_are_named_beside_the_effects(tmp_path, hybrid):
+    policy, layout = SamplingPolicy(), layout_with_prefix()
+    if hybrid:
+        policy.blocks[1].attention = Linear(policy.blocks[1].attention)
+        (joint,) = layout.sites
+        layout = replace(layout, sites=(replace(joint, keys=replace(joint.keys, layers=(0, 2))),))
+    store, _, said = fill(tmp_path / "a.zarr", policy, layout=layout)
+    effects = store.episodes[0].attributes.effects
+    assert effects.silent_blocks == (("blocks.1",) if hybrid else ())
+    assert sum("blocks.1" in line for line in said) == hybrid
+    found = recorded_effects(question_about(tmp_path / "a.zarr"), attention=False)
+    assert any("blocks.1" in note for note in found.notes) == hybrid
 
 
 def deaf_to(policy, replan):

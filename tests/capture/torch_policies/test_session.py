@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace
 from torch import nn
 
 import vla_attention as va
@@ -36,7 +38,7 @@ from vla_attention.capture.torch_policies.watch import NotFollowed
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import knockout
-from vla_attention.schemas.layout import Role
+from vla_attention.schemas.layout import Role, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import RunMismatch, StoreExists
 from vla_attention.schemas.stores.verify import verify_store
@@ -377,6 +379,48 @@ def test_masks_give_the_coverage_of_objects(tmp_path, policy):
         policy.act(**given())
     coverage = stored(tmp_path).episodes[0].read("objects/front")
     np.testing.assert_allclose(coverage[0, :, 1], [0.5, 0, 0, 0])
+
+
+def test_pieces_that_have_no_keys_are_refused(tmp_path, policy):
+    with start(tmp_path, policy, layout=small_layout(text=None)) as run, pytest.raises(PromptDoesNotFit):
+        one_call(run, policy, prompt=[None, "pick", " the", " bowl", None, None])
+
+
+class Writer(nn.Module):
+    """Embeds what it was told at once, then the tokens that it writes, one by one; `again`: all of them again."""
+
+    def __init__(self, table, again):
+        super().__init__()
+        self.table, self.again = table, again
+
+    def forward(self, ids):
+        told = self.table(ids[:, :4])
+        written = [self.table(ids[:, [place]]) for place in (4, 5)]
+        return self.table(ids) if self.again else torch.cat([told, *written], dim=1)
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_subtask_that_the_policy_writes_has_a_span_of_its_own(tmp_path, again):
+    policy = SmallPolicy()
+    policy.words = Writer(policy.words, again)
+    (joint,) = small_layout().sites
+    image, _, *others = joint.keys.spans
+    spans = (image, Span("prompt", "text", 4, 8), Span("subtask", "text", 8, 10), *others)
+    site = replace(joint, keys=replace(joint.keys, spans=spans), role_of_span={**joint.role_of_span, "subtask": "text"})
+    text = PromptText(("prompt",), "words.table")
+    with (
+        start(tmp_path, policy, layout=small_layout(sites=(site,), text=text)) as run,
+        pytest.raises(PromptDoesNotFit) if again else nullcontext(),
+    ):
+        one_call(run, policy, given(text="pick the bowl plate"))
+    text = replace(text, generated=("subtask",))
+    with start(tmp_path / "named", policy, layout=small_layout(sites=(site,), text=text)) as run:
+        one_call(run, policy, given(text="pick the bowl plate"))
+    episode = stored(tmp_path / "named").episodes[0]
+    pieces = {piece.key: piece.text for piece in episode.attributes.prompts[0].pieces}
+    assert pieces == {5: " pick", 6: " the", 7: " bowl", 8: " plate", 9: "\n"}
+    labels = [Role(code).label for code in episode.read("joint/key_role")[0][4:10]]
+    assert labels == ["bos", "instruction", "instruction", "instruction", "text", "text"]
 
 
 def test_a_prompt_may_be_given_as_pieces(tmp_path, policy):
