@@ -9,6 +9,7 @@ complete has to be the undisturbed one, to the byte.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -205,13 +206,15 @@ def _reference(folder: Path, calls: Calls, tasks: tuple[int, ...] = _TASKS) -> P
     return path
 
 
-def _signalled(number: int, expected: set[int]) -> Callable[[Series, list[int]], Iterator[dict[str, Any]]]:
+def _signalled(
+    number: int, expected: set[int], before_run: Callable[[Path], object] = lambda store: None
+) -> Callable[[Series, list[int]], Iterator[dict[str, Any]]]:
     """Cases in which a signal comes while an episode is under way, at a random moment."""
 
     def cases(series: Series, missing: list[int]) -> Iterator[dict[str, Any]]:
         for case in missing:
             random = Random(f"{series.name} {case}")
-            process = series.start()
+            process = series.start(before_run)
             running = series.mid_episode(process, random)
             simulators = _simulators_of(process)
             before = series.committed()
@@ -222,6 +225,37 @@ def _signalled(number: int, expected: set[int]) -> Callable[[Series, list[int]],
             yield told
 
     return cases
+
+
+def _refuse_links(store: Path) -> None:
+    """Let hard links be refused, as exFAT, gcsfuse and others do."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    os.link = refuse
+
+
+def _stopped(series: Series, missing: list[int]) -> Iterator[dict[str, Any]]:
+    """A capture stands still beyond its lock's time, another completes the store, and the first goes on."""
+    log, of_stopped = series.folder / "log", series.folder / "log.stopped"
+    for case in missing:
+        process = series.start()
+        running = series.mid_episode(process, Random(f"{series.name} {case}"))
+        if running:
+            os.kill(process, signal.SIGSTOP)
+            for lock in (series.store / ".writing").glob("*.lock"):
+                os.utime(lock, (1000, 1000))
+        before = series.committed()
+        log.rename(of_stopped)
+        second = series.case(case, before, forks.wait(series.start()), {0})
+        before = series.committed()
+        if running:
+            os.kill(process, signal.SIGCONT)
+        code = forks.wait(process)
+        of_stopped.rename(log)
+        told = series.case(case, before, code, {0})
+        yield {**told, "problems": second["problems"] + told["problems"]}
 
 
 def _simulators_of(process: int) -> list[int]:
@@ -373,7 +407,9 @@ SERIES: dict[str, tuple[Calls, Callable[[Series, list[int]], Iterator[dict[str, 
     "SIGKILL, replay": ("replay", _signalled(signal.SIGKILL, {-signal.SIGKILL})),
     "SIGTERM, rerun": ("rerun", _signalled(signal.SIGTERM, {EXIT_SIGTERM})),
     "SIGTERM, replay": ("replay", _signalled(signal.SIGTERM, {EXIT_SIGTERM})),
+    "SIGKILL, no hard links": (0, _signalled(signal.SIGKILL, {-signal.SIGKILL}, _refuse_links)),
     "a simulator killed": (2, _simulator_killed),
+    "stopped beyond its lock's time": (0, _stopped),
     "killed before each change of a file": (0, _every_boundary),
     "killed within a file": (0, _grown(kill=True)),
     "a write fails within a file": (0, _grown(kill=False)),
@@ -392,7 +428,9 @@ COUNTS = {
     "SIGKILL, replay": 60,
     "SIGTERM, rerun": 5,
     "SIGTERM, replay": 5,
+    "SIGKILL, no hard links": 40,
     "a simulator killed": 10,
+    "stopped beyond its lock's time": 40,
     "killed before each change of a file": 10_000,
     "killed within a file": 40,
     "a write fails within a file": 20,

@@ -90,7 +90,10 @@ class VideoPlace:
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode as the meta files describe it: number of frames, tasks, and its files inside of the data set."""
+    """One episode as the meta files describe it: number of frames, tasks, and its files inside of the data set.
+
+    tasks: empty where the meta files do not name them; the rows do in any case.
+    """
 
     index: int
     length: int
@@ -178,19 +181,23 @@ def read_info(folder: Path) -> DataSetInfo:
     if not (math.isfinite(fps) and fps > 0 and per_chunk > 0):
         raise DamagedDataSet(f"'{path}' has fps {fps} and chunks_size {per_chunk}; expected numbers above 0.")
     videos = [name for name, feature in features.items() if feature.dtype == "video"]
-    tasks, rows = _tables(folder, videos) if version == "v3.0" else _lines(folder)
+    tasks, rows = _tables(folder, videos, fps) if version == "v3.0" else _lines(folder)
     wrong = rows.filter((pl.col("episode_index") < 0) | (pl.col("length") < 1))
     if len(wrong):
         number, length = wrong.row(0)[:2]
         raise DamagedDataSet(f"'{folder}' has an episode {number} of {length} frames; expected at least one frame.")
+    # The last of several with one number counts.
+    rows = rows.unique("episode_index", keep="last").sort("episode_index")
+    if version == "v3.0":
+        for name in videos:
+            _check_times(folder, rows, f"videos/{name}", fps)
     info = DataSetInfo(
         version=version,
         fps=fps,
         robot_type=str(content.get("robot_type") or "unknown"),
         features=features,
         tasks=dict(zip(tasks["task_index"].to_list(), tasks["task"].to_list(), strict=True)),
-        # The last of several with one number counts.
-        rows=rows.unique("episode_index", keep="last").sort("episode_index"),
+        rows=rows,
         data_path=data_path,
         video_path=content.get("video_path"),
         per_chunk=per_chunk,
@@ -233,7 +240,35 @@ def _lines(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
     return tables[0], tables[1]
 
 
-def _tables(folder: Path, videos: Sequence[str]) -> tuple[pl.DataFrame, pl.DataFrame]:
+def _check_times(folder: Path, rows: pl.DataFrame, video: str, fps: float) -> None:
+    """Raise `DamagedDataSet` where an episode's part of a file is of another length, or begins in another's.
+
+    A merge that shifts the times of a part wrongly leaves such a table, and pictures of another episode.
+    """
+    file = [f"{video}/chunk_index", f"{video}/file_index"]
+    times = rows.select(
+        *file, "episode_index", "length", begins=f"{video}/from_timestamp", ends=f"{video}/to_timestamp"
+    ).sort(*file, "begins")
+    times = times.with_columns(
+        before=pl.col("episode_index").shift(1).over(file), ended=pl.col("ends").shift(1).over(file)
+    )
+    half = 0.5 / fps
+    for contradiction, is_wrong in (
+        ("has {length} frames", (pl.col("ends") - pl.col("begins") - pl.col("length") / fps).abs() > half),
+        ("begins before the end of episode {before} at {ended:.4g} s", pl.col("begins") < pl.col("ended") - half),
+    ):
+        wrong = times.filter(is_wrong)
+        if len(wrong):
+            one = wrong.row(0, named=True)
+            raise DamagedDataSet(
+                f"In '{folder / 'meta' / 'episodes'}', episode {one['episode_index']} is from {one['begins']:.4g} to "
+                f"{one['ends']:.4g} s of a file of '{video}' and {contradiction.format(**one)} ({len(wrong)} such "
+                "episodes): it would show pictures of another. Correct from_timestamp and to_timestamp, or merge the "
+                "data sets again."
+            )
+
+
+def _tables(folder: Path, videos: Sequence[str], fps: float) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Tasks and episodes of version 3.0."""
     path = folder / "meta" / "tasks.parquet"
     types = scan_table(path)[1]
@@ -248,9 +283,15 @@ def _tables(folder: Path, videos: Sequence[str]) -> tuple[pl.DataFrame, pl.DataF
         raise DataSetNotFound(f"The data set '{folder}' has no Parquet file in meta/episodes, which v3.0 needs.")
     whats = ["data", *(f"videos/{name}" for name in videos)]
     wanted = _EPISODES | {f"{what}/{number}": pl.Int64() for what in whats for number in ("chunk_index", "file_index")}
-    wanted |= {f"videos/{name}/from_timestamp": pl.Float64() for name in videos}
-    # Most columns are statistics of the episodes.
-    return tasks, pl.concat([_typed(path, read_table(path, list(wanted)), wanted) for path in files])
+    wanted |= {f"videos/{name}/{end}_timestamp": pl.Float64() for name in videos for end in ("from", "to")}
+    tables = []
+    for path in files:
+        untold = {"tasks"} - set(scan_table(path)[1])  # as in lerobot/libero: the rows name them
+        # Most columns are statistics of the episodes.
+        table = read_table(path, [name for name in wanted if name not in untold])
+        none = pl.lit([], wanted["tasks"]).alias("tasks")
+        tables.append(_typed(path, table.with_columns(none) if untold else table, wanted))
+    return tasks, pl.concat(tables)
 
 
 def _typed(path: Path, table: pl.DataFrame, types: Mapping[str, pl.DataType]) -> pl.DataFrame:

@@ -114,6 +114,11 @@ def decode_picture(what: str, content: bytes) -> NDArray[np.uint8]:
         raise DamagedDataSet(f"{what} cannot be decoded ({(str(error) or 'damaged').splitlines()[0]}).") from error
 
 
+def check_video_time(video: Path, seconds: float, tolerance: float) -> None:
+    """Raise `DamagedDataSet` unless a video has a picture at a time."""
+    _video(video).nearest(seconds, tolerance)
+
+
 def read_video_picture(video: Path, seconds: float, tolerance: float) -> NDArray[np.uint8]:
     """The picture of a video at a time; see `VideoFile.picture`."""
     return _video(video).picture(seconds, tolerance)

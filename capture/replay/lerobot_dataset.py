@@ -25,6 +25,7 @@ from vla_attention.capture.replay.data_set_files import (
     read_info,
 )
 from vla_attention.capture.replay.data_set_reader import (
+    check_video_time,
     open_episode,
     read_numbers,
     read_pictures,
@@ -247,6 +248,7 @@ class DataSetEpisode:
         # Texts and lists of several lengths are nothing that a policy reads as numbers.
         numbers = {name: it for name, it in self._numbers(of_numbers).items() if not isinstance(it, str)}
         self.dataset.fetch([self.entry.videos[name].path for name in names if name in self.entry.videos])
+        self._check_ends(names)
         for frame in range(0, self.length, every):
             images = self._pictures(names, frame)
             task = int(self.task_indices[frame])
@@ -259,6 +261,12 @@ class DataSetEpisode:
                 images={name: images[name] for name in names},
                 values={name: values[frame] for name, values in numbers.items()},
             )
+
+    def _check_ends(self, names: Sequence[str]) -> None:
+        """Raise `DamagedDataSet` where a video ends before the episode, whichever of its frames are read."""
+        for video in (self.entry.videos[name] for name in names if name in self.entry.videos):
+            path, last = self.dataset.folder / video.path, video.begins_at + float(self.seconds[-1])
+            self.dataset.process.call(path, check_video_time, path, last, TIME_TOLERANCE / self.dataset.fps)
 
     def _pictures(self, names: Sequence[str], frame: int) -> dict[str, NDArray[np.uint8]]:
         call, folder = self.dataset.process.call, self.dataset.folder

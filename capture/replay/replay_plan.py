@@ -83,12 +83,14 @@ class ReplayPlan:
 
     def job(self, index: int, every: int) -> EpisodeJob:
         """Return what is to be recorded of an episode. Its task is that of its first frame."""
-        episode = self.data.episode(index)
-        task_id = int(episode.task_indices[0])
+        task = self.task(int(self.data.episode(index).task_indices[0]))
+        return EpisodeJob(task, index, self.calls(index, every), f"episode {index}")
+
+    def task(self, task_id: int) -> Task:
+        """Return a task of the data set, with the instruction that it is given."""
         instruction = self.data.tasks[task_id] if self.settings.instruction is None else self.settings.instruction
         name = re.sub(r"\W+", "_", instruction.strip()).strip("_")[:60] or f"task_{task_id}"
-        task = Task(suite_of(self.data), task_id, name, instruction, num_initial_states=0)
-        return EpisodeJob(task, index, self.calls(index, every), f"episode {index}")
+        return Task(suite_of(self.data), task_id, name, instruction, num_initial_states=0)
 
     def calls(self, index: int, every: int) -> int:
         """Return the number of policy calls of an episode."""
@@ -186,7 +188,9 @@ def record_episodes(plan: ReplayPlan, store: RunStore, todo: Sequence[int], ever
         for index in todo:
             jobs.append(plan.job(index, every))
             advance(1)
-    loop = EpisodeLoop(store, plan_of((job.task, job.episode_index) for job in jobs), plan.termination, "call", source)
+    done = [(plan.task(task_id), index) for task_id, index in store.committed() if index in plan.wanted]
+    planned = plan_of([*((job.task, job.episode_index) for job in jobs), *done])
+    loop = EpisodeLoop(store, planned, plan.termination, "call", source)
     results = loop.record_all(jobs)
     plan.faults.dropped.update(loop.faults.dropped)
     return len(results)

@@ -103,12 +103,7 @@ class VideoFile:
             DamagedDataSet: no picture has this time.
             UndecodableVideo: the file is damaged.
         """
-        nearest = int(np.abs(self.times - seconds).argmin())
-        if not abs(self.times[nearest] - seconds) <= tolerance:
-            raise DamagedDataSet(
-                f"'{self.path}' has no picture at {seconds:.4f} s: its {len(self.times)} pictures are at "
-                f"{self.times[0]:.4f} to {self.times[-1]:.4f} s, the nearest at {self.times[nearest]:.4f} s."
-            )
+        nearest = self.nearest(seconds, tolerance)
         with self._refusing("is damaged"):
             is_near = self._current is not None and 0 <= nearest - self._place(self._current) <= _AHEAD
             for earlier in (None, *_EARLIER) if is_near else _EARLIER:
@@ -120,6 +115,16 @@ class VideoFile:
                 if frame is not None and not frame.is_corrupt and (frame.height, frame.width) == self._size:
                     return np.ascontiguousarray(frame.to_ndarray(format="rgb24"))
         raise UndecodableVideo(f"'{self.path}' is damaged: the picture at {seconds:.4f} s cannot be decoded whole.")
+
+    def nearest(self, seconds: float, tolerance: float) -> int:
+        """Return the place of the picture at a time; `DamagedDataSet` where none is."""
+        nearest = int(np.abs(self.times - seconds).argmin())
+        if not abs(self.times[nearest] - seconds) <= tolerance:
+            raise DamagedDataSet(
+                f"'{self.path}' has no picture at {seconds:.4f} s: its {len(self.times)} pictures are at "
+                f"{self.times[0]:.4f} to {self.times[-1]:.4f} s, the nearest at {self.times[nearest]:.4f} s."
+            )
+        return nearest
 
     def _place(self, frame: Any) -> int:
         return int(np.searchsorted(self._stamps, frame.pts))

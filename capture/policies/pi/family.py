@@ -66,7 +66,9 @@ class PiSettings(ModelSettings):
     )
     discrete_state_input: bool = option("openpi's pi0.5 trained with the state in its prompt", False)
     norm_stats: Path | None = option(
-        "openpi's norm_stats.json of the training (default: the one in the checkpoint's assets)", None
+        "openpi's norm_stats.json of the training, or for a LeRobot checkpoint its data set's meta/stats.json "
+        "(default: those of the checkpoint)",
+        None,
     )
     asset_id: str | None = option("which statistics, where the checkpoint's assets have several", None)
     camera: tuple[str, ...] = option(

@@ -9,14 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint, read_typed
+from vla_attention.capture.foreign_files.checked_files import read_object
+from vla_attention.capture.policies.checkpoints import (
+    CheckpointNotFound,
+    UnreadableCheckpoint,
+    UnsupportedCheckpoint,
+    read_typed,
+)
 from vla_attention.capture.policies.pi.formats import PREPROCESSOR
 from vla_attention.capture.policies.pi.lerobot_config import ACTION_FEATURE, STATE_FEATURE, LerobotConfig
 from vla_attention.capture.policies.pi.preprocess import Normaliser
@@ -34,6 +40,7 @@ _NOTHING = {"to_batch_processor", "device_processor"}
 _BEFORE = _NOTHING | {_RENAME, _NORMALIZE, _NEW_LINE, _STATE_PROMPT, _TOKENIZE, _RELATIVE}
 _AFTER = _NOTHING | {_UNNORMALIZE, _ABSOLUTE}
 
+_GIVE_THEM = "give those of its data set with --norm-stats FILE (meta/stats.json of a LeRobotDataset 2.0 or 3.0)"
 #: Statistics of each mode of normalisation.
 _NEEDED = {"IDENTITY": (), "MEAN_STD": ("mean", "std"), "QUANTILES": ("q01", "q99")}
 
@@ -76,8 +83,11 @@ class LerobotPipeline:
     action: Normaliser
 
 
-def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipeline:
-    """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting."""
+def read_lerobot_pipeline(folder: Path, config: LerobotConfig, norm_stats: Path | None = None) -> LerobotPipeline:
+    """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting.
+
+    norm_stats: a data set's `meta/stats.json`, which counts instead of the checkpoint's own statistics.
+    """
     before, after = _steps(folder, PREPROCESSOR, _BEFORE), _steps(folder, POSTPROCESSOR, _AFTER)
     state_in_prompt, new_line = _STATE_PROMPT in before, _NEW_LINE in before
     if state_in_prompt != config.pi05 or (new_line and config.pi05):
@@ -102,8 +112,8 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
         rename=before.get(_RENAME, _Step()).config.rename_map or {},
         prompt_format="task-state-action" if state_in_prompt else without_state,
         cut_long_prompts=tokenizer.truncation,
-        state=_normaliser(folder / PREPROCESSOR, before.get(_NORMALIZE), "STATE", STATE_FEATURE, config),
-        action=_normaliser(folder / POSTPROCESSOR, after.get(_UNNORMALIZE), "ACTION", ACTION_FEATURE, config),
+        state=_normaliser(folder / PREPROCESSOR, before.get(_NORMALIZE), "STATE", config, norm_stats),
+        action=_normaliser(folder / POSTPROCESSOR, after.get(_UNNORMALIZE), "ACTION", config, norm_stats),
     )
 
 
@@ -129,7 +139,10 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, _Step]:
     return by_name
 
 
-def _normaliser(path: Path, step: _Step | None, kind: str, feature: str, config: LerobotConfig) -> Normaliser:
+def _normaliser(
+    path: Path, step: _Step | None, kind: Literal["STATE", "ACTION"], config: LerobotConfig, norm_stats: Path | None
+) -> Normaliser:
+    feature = STATE_FEATURE if kind == "STATE" else ACTION_FEATURE
     if step is None:
         raise UnsupportedCheckpoint(f"'{path}' has no step that says how to normalise {feature}.")
     modes = {**(config.normalization_mapping or {}), **(step.config.norm_map or {})}
@@ -141,7 +154,12 @@ def _normaliser(path: Path, step: _Step | None, kind: str, feature: str, config:
     if mode not in _NEEDED:
         raise UnsupportedCheckpoint(f"'{path}' normalises {kind} by {mode}; supported are {listing(_NEEDED)}.")
     dim = config.state_dim if kind == "STATE" else config.action_dim
-    statistics = _statistics(path.parent, step.state_file or "", feature, _NEEDED[mode], dim)
+    statistics = {}
+    if _NEEDED[mode]:
+        given = None if norm_stats is None else norm_stats.expanduser()
+        place = _place_of_statistics(path, step.state_file or "", feature) if given is None else given
+        read = _of_checkpoint if given is None else _of_data_set
+        statistics = read(place, feature, _NEEDED[mode], dim)
     return lerobot_normaliser(mode, statistics, step.config.eps, dim)
 
 
@@ -162,26 +180,54 @@ def lerobot_normaliser(mode: str, statistics: Mapping[str, NDArray[np.float32]],
     return Normaliser(mode, 0 * one, one, one)
 
 
-def _statistics(
-    folder: Path, state_file: str, feature: str, needed: Sequence[str], dim: int
-) -> dict[str, NDArray[np.float32]]:
-    if not needed:
-        return {}
-    path = folder / state_file
+def _place_of_statistics(pipeline: Path, state_file: str, feature: str) -> Path:
+    if not state_file:
+        raise UnreadableCheckpoint(f"'{pipeline}' names no file with the statistics of '{feature}'; {_GIVE_THEM}.")
+    path = pipeline.parent / state_file
     # A name with folders in it could lead out of the checkpoint.
-    if not state_file or Path(state_file).name != state_file or not path.exists():
-        raise UnreadableCheckpoint(f"The statistics of '{feature}' should be in '{path}', which is not there.")
-    values: dict[str, NDArray[np.float32]] = {}
+    if Path(state_file).name != state_file or not path.exists():
+        raise UnreadableCheckpoint(
+            f"The statistics of '{feature}' should be in '{path}', which is not there; {_GIVE_THEM}."
+        )
+    return path
+
+
+def _of_checkpoint(path: Path, feature: str, needed: Sequence[str], dim: int) -> dict[str, NDArray[np.float32]]:
     with open_safetensors(path) as stored:
         shapes = stored.shapes()
         for key in needed:
-            name = f"{feature}.{key}"
-            shape = shapes.get(name, "none")
-            if shape != (dim,):
-                raise UnreadableCheckpoint(
-                    f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed."
-                )
-            values[key] = stored.read(name).float().numpy()
-            if not np.isfinite(values[key]).all():
-                raise UnreadableCheckpoint(f"The statistics '{name}' of '{path}' hold NaN or infinity.")
+            _check_shape(path, f"{feature}.{key}", shapes.get(f"{feature}.{key}"), dim)
+        values = {key: stored.read(f"{feature}.{key}").float().numpy() for key in needed}
+    return _finite(path, feature, values)
+
+
+def _of_data_set(path: Path, feature: str, needed: Sequence[str], dim: int) -> dict[str, NDArray[np.float32]]:
+    try:
+        of_feature = read_object(path, UnreadableCheckpoint).get(feature)
+    except FileNotFoundError:
+        raise CheckpointNotFound(f"There is no file of statistics at '{path}'.") from None
+    values = {}
+    for key in needed:
+        try:
+            values[key] = np.asarray(of_feature[key], dtype=np.float32)  # type: ignore[index]
+        except (KeyError, TypeError, ValueError):
+            raise UnreadableCheckpoint(
+                f"'{path}' has no numbers '{key}' of '{feature}', which the policy needs; expected the "
+                "meta/stats.json of a LeRobotDataset."
+            ) from None
+        _check_shape(path, f"{feature}.{key}", values[key].shape, dim)
+    return _finite(path, feature, values)
+
+
+def _check_shape(path: Path, name: str, shape: tuple[int, ...] | None, dim: int) -> None:
+    if shape != (dim,):
+        raise UnreadableCheckpoint(
+            f"The statistics '{name}' of '{path}' have shape {shape or 'none'}; {dim} numbers are needed."
+        )
+
+
+def _finite(path: Path, feature: str, values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
+    for key, numbers in values.items():
+        if not np.isfinite(numbers).all():
+            raise UnreadableCheckpoint(f"The statistics '{feature}.{key}' of '{path}' hold NaN or infinity.")
     return values

@@ -116,9 +116,9 @@ def choose_config(
             "--discrete-state-input out.",
         ),
         (
-            found == "lerobot" and (settings.norm_stats or settings.asset_id),
+            found == "lerobot" and settings.asset_id,
             "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
-            "--norm-stats and --asset-id out.",
+            "--asset-id out, or give those of its data set with --norm-stats FILE.",
         ),
     ):
         if is_wrong:
@@ -233,7 +233,7 @@ def _plan(settings: PiSettings) -> _Planned:
     dtype: str = settings.dtype or "float32"
     if found == "lerobot":
         stated = read_lerobot_config(folder)
-        pipeline = read_lerobot_pipeline(folder, stated)
+        pipeline = read_lerobot_pipeline(folder, stated, settings.norm_stats)
         dtype = settings.dtype or stated.dtype
         if data is not None:
             robot = lerobot_robot(stated, pipeline.rename, data)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -217,6 +218,57 @@ def test_a_video_that_is_shorter_than_its_table_is_refused(tmp_path):
     write_video(next(folder.glob("videos/**/*.mp4")), [numbered_picture(i) for i in range(5)], 10, H264)
     with pytest.raises(DamagedDataSet, match=r"0\.5000 s: .* 5 .* 0\.0000 to 0\.4000 s"):
         list(open_dataset(folder).episode(0).frames())
+
+
+def with_times(folder: Path, episode: int, **columns: pl.Expr) -> None:
+    """Change columns of times of one episode in the table of a data set of version 3.0."""
+    (path,) = (folder / "meta" / "episodes").rglob("*.parquet")
+    is_it = pl.col("episode_index") == episode
+    named = {f"videos/observation.images.front/{name}_timestamp": value for name, value in columns.items()}
+    changed = [pl.when(is_it).then(value).otherwise(pl.col(name)).alias(name) for name, value in named.items()]
+    pl.read_parquet(path).with_columns(changed).write_parquet(path)
+
+
+@pytest.mark.parametrize("shift", [-0.7, -0.1, 0.3])
+def test_an_episode_whose_pictures_are_said_to_be_anothers_is_refused(tmp_path, shift):
+    """Of three in one file, the second; a gap of half a frame is none, one to the third is an overlap."""
+    folder = write_data_set(tmp_path / "a", "v3.0", made_up_episodes((7, 5, 9)), video=H264, episodes_per_file=3)
+    begins, ends = (pl.col(f"videos/observation.images.front/{name}_timestamp") for name in ("from", "to"))
+    with_times(folder, 1, **{"from": begins + 0.04, "to": ends + 0.04})
+    assert len(open_dataset(folder).episodes) == 3
+    with_times(folder, 1, **{"from": begins + shift, "to": ends + shift})
+    with pytest.raises(DamagedDataSet, match=r"episode [12]"):
+        open_dataset(folder)
+    with_times(folder, 1, **{"from": begins - shift - 0.04, "to": ends - shift + 0.3})
+    with pytest.raises(DamagedDataSet, match="episode 1"):
+        open_dataset(folder)
+
+
+def test_deleted_episodes_leave_gaps_in_a_video(tmp_path):
+    folder = write_data_set(tmp_path / "a", "v3.0", made_up_episodes((7, 5, 9)), video=H264, episodes_per_file=3)
+    (path,) = (folder / "meta" / "episodes").rglob("*.parquet")
+    pl.read_parquet(path).filter(pl.col("episode_index") != 1).write_parquet(path)
+    data = open_dataset(folder)
+    assert data.episode_numbers == [0, 2]
+    shown = [number_of(frame.images["observation.images.front"]) for frame in data.episode(2).frames()]
+    assert shown == [200 + frame for frame in range(9)]
+
+
+def test_a_video_that_ends_before_frames_that_are_not_read_is_refused(tmp_path):
+    folder = write_data_set(tmp_path / "a", "v3.0", made_up_episodes((7, 5)), video=H264)
+    with_times(folder, 1, **{f: pl.col(f"videos/observation.images.front/{f}_timestamp") + 0.2 for f in ("from", "to")})
+    with pytest.raises(DamagedDataSet, match=r"1\.3000 s"):
+        next(open_dataset(folder).episode(1).frames(every=3))
+
+
+def test_tasks_may_be_in_the_rows_alone(tmp_path):
+    folder = write_data_set(tmp_path / "a", "v3.0", made_up_episodes())
+    (path,) = (folder / "meta" / "episodes").rglob("*.parquet")
+    pl.read_parquet(path).drop("tasks").write_parquet(path)
+    data = open_dataset(folder)
+    assert [entry.tasks for entry in data.episodes] == [(), (), ()]
+    tasks = ["put the cup on the plate", "open the drawer", "put the cup on the plate"]
+    assert [set(data.episode(number).instructions) for number in range(3)] == [{task} for task in tasks]
 
 
 def test_a_damaged_video_and_a_damaged_picture_are_refused(tmp_path):

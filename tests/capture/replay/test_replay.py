@@ -13,6 +13,7 @@ import zarr
 import vla_attention as va
 from tests.kit.lerobot_data_sets import H264, episodes_of_store, made_up_episodes, number_of, write_data_set
 from tests.kit.pi_golden import GOLDEN
+from tests.kit.races import unlike
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
 from tests.thorough.hostile_data_sets.run_cases import CASES
@@ -144,6 +145,20 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     assert run("replay", data, *TINY, *cameras, "--every", 2, "--output", store, "--resume") == 2
     assert re.search(r"protocol\.replan_steps .*3,.* 2", capsys.readouterr().err)
     assert analyze(["store", "verify", str(store)]) == 0
+
+
+def test_a_resumed_replay_has_the_bytes_of_an_undisturbed_one(tmp_path):
+    made = made_up_episodes((7, 5, 9, 6), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
+    data = write_data_set(tmp_path / "data", "v3.0", made)
+    whole, resumed = tmp_path / "a/replay.zarr", tmp_path / "b/replay.zarr"
+    assert run("replay", data, *TINY, "--every", 3, "--output", whole) == 0
+    shutil.copytree(whole, resumed)
+    for name in ("task000_episode000", "task001_episode003"):
+        shutil.rmtree(resumed / "episodes" / name)
+    assert run("replay", data, *TINY, "--every", 3, "--output", resumed, "--resume") == 0
+    shutil.rmtree(resumed / "episodes/task000_episode002")
+    assert run("replay", data, *TINY, "--every", 3, "--output", resumed, "--resume") == 0
+    assert unlike(whole, resumed) == ()
 
 
 def test_another_instruction_and_known_outcomes(tmp_path):

@@ -279,6 +279,35 @@ def test_missing_damaged_and_misshapen_statistics(checkpoint):
         read_lerobot_pipeline(checkpoint, config)
 
 
+def test_statistics_of_a_data_set(checkpoint, tmp_path):
+    """Where the checkpoint has none, as those have that are to be trained further."""
+    config, stats = read_lerobot_config(checkpoint), {}
+    own = read_lerobot_pipeline(checkpoint, config)
+    for state_file in checkpoint.glob("policy_*_step_*.safetensors"):
+        for name, values in load_file(state_file).items():
+            feature, _, key = name.rpartition(".")
+            stats.setdefault(feature, {})[key] = values.tolist()
+        state_file.unlink()
+    for name in ("pre", "post"):
+        edit(checkpoint / f"policy_{name}processor.json", lambda c: [s.pop("state_file", None) for s in c["steps"]])
+    with pytest.raises(UnreadableCheckpoint, match=r"policy_preprocessor\.json' .*--norm-stats FILE"):
+        read_lerobot_pipeline(checkpoint, config)
+    given = tmp_path / "stats.json"
+    given.write_text(json.dumps(stats))
+    read = read_lerobot_pipeline(checkpoint, config, given)
+    for mine, its in ((read.state, own.state), (read.action, own.action)):
+        assert mine.mode == its.mode
+        for name in ("offset", "divisor", "factor"):
+            np.testing.assert_array_equal(getattr(mine, name), getattr(its, name))
+    for wrong in ([1.0], None, "text", [[1.0], [2.0, 3.0]], [float("nan")] * config.state_dim):
+        given.write_text(json.dumps(stats | {"observation.state": dict.fromkeys(stats["observation.state"], wrong)}))
+        with pytest.raises(UnreadableCheckpoint, match=r"stats\.json"):
+            read_lerobot_pipeline(checkpoint, config, given)
+    given.write_text(json.dumps({"action": stats["action"]}))
+    with pytest.raises(UnreadableCheckpoint, match=r"observation\.state"):
+        read_lerobot_pipeline(checkpoint, config, given)
+
+
 def test_the_type_must_be_that_of_the_tensors(checkpoint, tokenizer_path):
     pi05 = read_lerobot_config(checkpoint).pi05
     other = GOLDEN / ("pi0_batch2" if pi05 else "pi05_batch2") / "checkpoint_lerobot" / "model.safetensors"
