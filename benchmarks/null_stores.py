@@ -125,9 +125,11 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
     if kind == "analyze":
         numbers = store.analyze().findings[0].numbers
         return not float(numbers["ratio_lift_low"]) <= 1 <= float(numbers["ratio_lift_high"])
-    *behaved, attention = (finding.numbers for finding in store.compare(paths[1]).findings)
-    tests = [float(p) for numbers in behaved for name, p in numbers.items() if name.split("_")[0] == "p"]
-    return min(tests, default=1.0) <= LEVEL or any(attention.values())
+    numbers = {finding.asks: finding.numbers for finding in store.compare(paths[1]).findings}
+    attention, looks = numbers.pop("And the attention?"), numbers.pop("Do they look for what is named?", {})
+    tests = [float(p) for of in numbers.values() for name, p in of.items() if name.split("_")[0] == "p"]
+    named = [float(q) <= LEVEL / 6 for name, q in looks.items() if name.endswith("_ratio_q") and q is not None]
+    return min(tests, default=1.0) <= LEVEL or any(attention.values()) or any(named)
 
 
 def says_it_listens(sets: int, planted: bool) -> float:
