@@ -77,7 +77,9 @@ def words(question: Question, by: Collection[str] = ()) -> Result:
 
 def _without_shares(rows: pl.LazyFrame) -> pl.LazyFrame:
     """State digits and patches are no part of the mass of language."""
-    outside = pl.col("item").is_in([SCALE[Role.STATE], SCALE[Role.IMAGE]]) & (pl.col("kind") == "scale")
+    outside = pl.col("item").is_in([SCALE[role] for role in (Role.STATE, Role.IMAGE, Role.BORDER)]) & (
+        pl.col("kind") == "scale"
+    )
     return rows.with_columns(share=pl.when(~outside).then("share"))
 
 
