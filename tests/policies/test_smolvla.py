@@ -91,7 +91,8 @@ def test_rows_are_those_of_the_policy_s_own_queries_and_keys(case, tmp_path):
 
 def test_keys_have_the_roles_of_pictures_separators_words_and_padding(case, tmp_path):
     store = record(case, tmp_path)
-    camera = ["template"] * 2 + ["image"] * PATCHES + ["template"]
+    # Pictures of 48 x 64 have black above: the first row of 4 x 4 patches.
+    camera = ["template"] * 2 + ["border"] * 4 + ["image"] * (PATCHES - 4) + ["template"]
     prompt = ["instruction"] * WORDS + ["padding"] * 2 + ["absent"] * 4
     assert roles_of(store, "cross") == [*camera, *camera, *prompt, "state"]
     assert roles_of(store, "self") == [*camera, *camera, *prompt, "state", *["action"] * CHUNK]
