@@ -61,6 +61,8 @@ def language_test(
     Raises:
         BadArgument: fewer than two inputs, no prompt, actions of other shapes, or actions that never differ.
     """
+    if not all(isinstance(given, tuple | list) and len(given) == 2 for given in inputs):
+        raise BadArgument("An input is no pair; expected pairs (observation, instruction), as [(picture, 'lift it')].")
     kinds = prompts if isinstance(prompts, Mapping) else {text: text for text in prompts}
     texts = [(kind, text) for kind, given in kinds.items() for text in ([given] if isinstance(given, str) else given)]
     if not all(isinstance(text, str) for text in [*(text for _, text in texts), *(own for _, own in inputs)]):

@@ -166,7 +166,7 @@ class ShownEpisode:
         """A stored picture as a person sees the scene, as PNG."""
         from PIL import Image
 
-        item = next((item for item in map(self.item, self._site_names) if camera in item.tokens.layout.pictured), None)
+        item = next((item for item in map(self.item, self._site_names) if camera in item.tokens.layout.cameras), None)
         if item is None:
             raise unknown_name("camera", camera, [view.name for view in self.store.attributes.policy.cameras])
         picture = stored_picture(item, camera, check_replan(item, replan))

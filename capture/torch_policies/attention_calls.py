@@ -6,10 +6,11 @@ beside it, for the wanted queries only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal
 
 import torch
@@ -183,10 +184,12 @@ def refuse_rows(shape: CallShape, why: str) -> None:
 class Watcher:
     """Is told about every attention call of a watched block, in order. This one takes and changes nothing.
 
-    changes: whether it is asked for changes at all. modules: the ids of the policy's modules that ran.
+    changes: whether it is asked for changes at all. modules: the ids of the policy's modules that ran. unmet: softmaxes
+    that met no values, and the last function that their result was followed to.
     """
 
     changes: Any = False
+    unmet: Mapping[int, tuple[CallShape, str]] = MappingProxyType({})
 
     @cached_property
     def modules(self) -> set[int]:

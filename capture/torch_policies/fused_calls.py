@@ -7,7 +7,7 @@ Run eager, it applies the mask function to every key, whatever the blocks say.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch._higher_order_ops.flex_attention import flex_attention as flex_operator
 from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.nn.attention.bias import CausalBias
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_tensors import (
@@ -63,7 +64,9 @@ def watch_sdpa(
     """Run one call, changed if the watcher says so, and tell the watcher about it."""
     given = _SdpaArguments(*args, **kwargs)
     query, key = given.query, given.key
-    mode.refuse_nested(query, key)
+    mode.refuse_without_numbers(query, key)
+    if isinstance(given.attn_mask, CausalBias):  # it has no numbers of its own
+        given = replace(given, attn_mask=given.attn_mask._materialize(query.device))
     dtype = query.dtype
     if torch.is_autocast_enabled(query.device.type):
         dtype = torch.get_autocast_dtype(query.device.type)
@@ -176,7 +179,7 @@ def watch_flex(
         **kwargs,
     }
     query, key, value = (given[name] for name in names[:3])
-    mode.refuse_nested(query, key)
+    mode.refuse_without_numbers(query, key)
     batch, heads, queries, _ = query.shape
     keys = key.shape[2]
     shape = mode.new_shape(mode.where()[0], "flex", (batch, heads, key.shape[1], queries, keys), query.dtype)

@@ -192,7 +192,7 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
     with watch_attention(policy, shapes):
         call()
     if not shapes.calls:
-        raise NoAttention(no_attention(policy))
+        raise NoAttention(no_attention(policy, shapes.unmet))
     if first_row is not None:
         alone = _Shapes(first_rows={})
         random.again()

@@ -18,7 +18,7 @@ from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention, aligned
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite, check_is_layout
 from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
@@ -166,6 +166,7 @@ def check_layout(
         SelectorError: a name that the layout does not have.
         BadArgument: keys of the layout that the call does not have, or words without a tokenizer.
     """
+    check_is_layout(layout)
     if not perturb:
         raise BadArgument("va.check_layout got no changes; expected a dictionary from keys to policy calls.")
     for selector in perturb:
@@ -184,7 +185,7 @@ def check_layout(
         with keys.ids.watched(), watch_attention(found, keys):
             call()
         if not keys.ran:
-            raise NoAttention(f"In {what}: {no_attention(found.policy)}")
+            raise NoAttention(f"In {what}: {no_attention(found.policy, keys.unmet)}")
         keys.check(what)
         return keys
 

@@ -39,11 +39,19 @@ _FOLDS = {
 }  # fmt: skip
 #: What is replayed in their place: the output of the replay may lie otherwise in memory than the call's.
 _RESHAPES = {"view": Tensor.reshape, "view_as": Tensor.reshape_as}
-_SUMS = {"add", "radd", "iadd", "sub", "rsub", "isub", "addcmul"}
+#: Sums that change what they add, or where.
+_FUSED_PRODUCTS = {"addmm", "addbmm", "baddbmm"}
+_FUSED_SUMS = {"addcmul", "lerp", "index_add", "scatter_add"} | _FUSED_PRODUCTS
+_SUMS = {"add", "radd", "iadd", "sub", "rsub", "isub"} | _FUSED_SUMS
 _MATRIX_PRODUCTS = {"linear", "matmul", "bmm", "mm", "einsum", "rmatmul", "conv1d"}
 _PRODUCTS = {"mul", "rmul", "imul"} | _MATRIX_PRODUCTS
 _QUOTIENTS = {"div", "truediv", "itruediv", "true_divide"}
 _JOINS = {"cat", "concat", "stack", "sum", "mean", "neg"}
+_STACKS, _SUMS_OF_STACKS = {"cat", "concat", "stack"}, {"sum", "mean"}
+#: Functions that choose some of the numbers, by a mask or by places.
+_CHOICES = {"where", "masked_fill", "index_copy", "index_put", "scatter", "slice_scatter", "select_scatter"}
+#: Functions that keep the numbers of a range, and are copies where all of them are in it.
+_RANGES = {"clamp", "clip", "clamp_min", "clamp_max", "nan_to_num", "hardtanh"}
 #: Functions that multiply every number with a factor of its own: a norm, or a dropout.
 _SCALES = {"rms_norm", "dropout"}
 #: Functions that write one tensor into another.
@@ -157,6 +165,7 @@ class _Step:
         is_sum: whether it is the last of them, and not something computed of it.
         projected: whether a matrix product stands on its way, from the last sum on.
         factor: whether it is made of numbers such as those by which a norm divides.
+        stacked: whether other tensors as large stand beside it on an axis.
         goes_on: whether it is the last of the sums behind norms, or written into another tensor.
     """
 
@@ -166,6 +175,7 @@ class _Step:
     projected: bool = False
     factor: bool = False
     goes_on: bool = False
+    stacked: bool = False
 
 
 _Steps = Sequence[tuple[Tensor, _Step]]
@@ -220,15 +230,20 @@ class OutputWays:
             self._lose(way, "writes over a part of a sum with")
         elif call.name in _SUMS:
             self._add(way, call, steps, results[0])
+        elif call.name in _SUMS_OF_STACKS and any(step.stacked for _, step in steps) and results[0].shape:
+            self._sum(way, call, steps, results[0])
         else:
             sums = _sums(steps)
             projected = call.name in _MATRIX_PRODUCTS or any(step.projected for _, step in steps)
             replay = self._replay(call, steps)
             if replay is not None:
-                is_sum = call.name in _COPIES | _FOLDS and any(step.is_sum for _, step in steps)
+                is_sum = call.name in _COPIES | _FOLDS | _RANGES | _WRITES and any(step.is_sum for _, step in steps)
+                stacked = (call.name in _FOLDS and steps[0][1].stacked) or (
+                    call.name in _STACKS and len(list(used_tensors(call.name, call.args, call.kwargs))) > len(steps)
+                )
                 for position, result in enumerate(results):
                     picked = replay if isinstance(call.result, Tensor) else _picked(replay, position)
-                    self._put([result], way, _Step(picked, sums, is_sum, projected))
+                    self._put([result], way, _Step(picked, sums, is_sum, projected, stacked=stacked))
                 return
             factor = all(step.factor for _, step in steps) or _is_norm(call.name, steps, results)
             if not way.changed and any(step.replay is not None for _, step in steps) and not factor:
@@ -238,7 +253,7 @@ class OutputWays:
 
     def _add(self, way: OutputWay, call: _Call, steps: _Steps, result: Tensor) -> None:
         """Note a sum, which may be the residual stream."""
-        sums, projected = _sums(steps), any(step.projected for _, step in steps)
+        sums, projected = _sums(steps), any(step.projected for _, step in steps) or call.name in _FUSED_PRODUCTS
         others = [
             tensor
             for tensor in tensors_among((*call.args, *call.kwargs.values()))
@@ -289,7 +304,7 @@ class OutputWays:
             self._lose(way)
             return
         of_added, added = replay, result
-        if len(steps) == 1 and call.name != "addcmul":
+        if len(steps) == 1 and call.name in _SUMS - _FUSED_SUMS:
             # What is added is compared, for the stream may be many times as large.
             tensor, step = steps[0]
             factor = 1 if call.args[:1] and call.args[0] is tensor else call.kwargs.get("alpha", 1)
@@ -394,12 +409,14 @@ class _Call:
             return None
         (tensor, step), single = steps[0], len(linear) == 1
         factors = len(linear) < len({id(tensor) for tensor, _ in steps})
+        if self.name in _RANGES and single and torch.equal(self.result, tensor):
+            return step.replay
         divided = self.name in _QUOTIENTS and id(self.args[0]) in linear and not self.kwargs.get("rounding_mode")
         if self.name in _SCALES and single and step.replay is not None:
             return _scaled(step.replay, (self.result.float() / tensor.float()).nan_to_num())
         once = sum(step.replay is not None for _, step in steps) == 1  # a square is not linear
         product = single and once and (self.name in _PRODUCTS or divided)
-        if not product and (factors or self.name not in _COPIES | _FOLDS | _SUMS | _JOINS):
+        if not product and (factors or self.name not in _COPIES | _FOLDS | _SUMS | _JOINS | _CHOICES):
             return None
         if self.name in _COPIES:
             return step.replay
@@ -407,6 +424,8 @@ class _Call:
         given, form = pytree.tree_flatten((first, dict(self.kwargs)))
         given = [_Followed(linear[id(value)]) if id(value) in linear else value for value in given]
         function, in_place = _RESHAPES.get(self.name, self.function), self.in_place
+        if in_place and hasattr(Tensor, self.name):  # of many outputs at once, nothing can be written into one tensor
+            function, in_place = getattr(Tensor, self.name), False
 
         def replay(output: Tensor) -> Tensor:
             values = [_filled(value, output) for value in given]

@@ -379,6 +379,15 @@ class PolicyLayout(Document, frozen=True):
         raise unknown_name("site", name, [site.name for site in self.sites])
 
 
+def check_is_layout(layout: object) -> None:
+    """Raise `BadArgument` for what is no layout."""
+    if not isinstance(layout, PolicyLayout):
+        raise BadArgument(
+            f"The layout is of type {type(layout).__name__}; expected a va.PolicyLayout (docs/my-policy.md). "
+            "va.inspect(policy, call) shows the calls that it has to name."
+        )
+
+
 def check_versions(layout: PolicyLayout, installed: dict[str, str | None]) -> str | None:
     """Say in a sentence which installed libraries the layout was not written for; None when all fit.
 

@@ -21,6 +21,7 @@ from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
     PolicyLayout,
     RecordedSite,
+    check_is_layout,
     check_versions,
 )
 from vla_attention.capture.torch_policies.policy_weights import device_and_dtype, policy_digest
@@ -120,6 +121,7 @@ def record(
         BatchRowsMixed: a change of one row of the batch of `own_setting` changes the actions of another.
         BadArgument: a number of a layer, head or denoise step does not exist.
     """
+    check_is_layout(layout)
     if resume and overwrite:
         raise BadArgument("Give resume=True or overwrite=True, not both.")
     installed = {library: installed_version(library) for library in (*layout.versions, *_LIBRARIES)}

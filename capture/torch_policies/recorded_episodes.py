@@ -14,6 +14,7 @@ from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import ReplanRecord
+from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.recorded_call import RowOfCall
 from vla_attention.capture.torch_policies.replan_inputs import (
     EpisodeFacts,
@@ -67,6 +68,7 @@ class Episode:
     num_steps: int | None = None
     num_dropped: int = 0
     largest_error: float = 0.0
+    unmet: Mapping[int, tuple[CallShape, str]] = field(default_factory=dict, repr=False)
     folder: Path | None = None
     _batch: EpisodeBatch | None = field(default=None, repr=False)
     _ended: bool = field(default=False, repr=False)
@@ -151,7 +153,7 @@ class Episode:
         if writer is None or not writer.records:
             raise NothingRecorded(
                 f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}. "
-                f"{no_attention(self.run.policy)}"
+                f"{no_attention(self.run.policy, self.unmet)}"
             )
         facts = {
             **writer.start.provenance,

@@ -144,7 +144,7 @@ def read_inputs(
     values = {name: value for name, value in given.items() if value is not None}
     sites = [site.keys for site in layout.sites]
     fits = {camera.name: camera.fit for camera in layout.cameras}
-    cameras = layout.camera_names
+    cameras, with_patches = layout.camera_names, {camera for site in sites for camera in site.pictured}
     for what in ("frames", "masks", "coverage", "roles"):
         if not isinstance(values.get(what, {}), Mapping):
             raise BadArgument(
@@ -159,17 +159,17 @@ def read_inputs(
         for camera in values.get(what, ()):
             if camera not in cameras:
                 raise unknown_name(f"camera of {what}", camera, cameras)
-            if not any(camera in site.pictured for site in sites):
+            if what != "frames" and camera not in with_patches:
                 raise BadArgument(
-                    f"The camera '{camera}' has no patches in the layout, so that its picture has no size: leave it "
-                    f"out of {what}, or give a span of it a grid (va.PatchGrid)."
+                    f"The camera '{camera}' has no patches in the layout, which objects could cover: leave it out of "
+                    f"{what}, or give a span of it a grid (va.PatchGrid)."
                 )
     pictures, shown = values.get("frames", {}), dict[str, Part]()
     frames = {}
     for camera in cameras:
         if camera in pictures:
-            size, fit = picture_size(sites, camera), fits.get(camera, "stretch")
-            frames[camera], part = model_picture(pictures[camera], camera, size, fit)
+            size = picture_size(sites, camera) if camera in with_patches else None  # latents have any
+            frames[camera], part = model_picture(pictures[camera], camera, size, fits.get(camera, "stretch"))
             shown |= {camera: part} if part != WHOLE else {}
     coverage = {camera: np.asarray(array, dtype=np.float32) for camera, array in values.get("coverage", {}).items()}
     for camera, mask in values.get("masks", {}).items():
@@ -215,19 +215,22 @@ def read_actions(given: Any) -> NDArray[np.float64] | None:
     return _numbers("actions", given, 2, "(horizon, action_dim) or (action_dim,)")
 
 
-def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: PictureFit) -> tuple[NDArray[np.uint8], Part]:
+def model_picture(
+    picture: Any, camera: str, size: tuple[int, int] | None, fit: PictureFit
+) -> tuple[NDArray[np.uint8], Part]:
     """Return a camera's picture as (height, width, 3) uint8 of the model's input size, and the part that shows it.
 
     picture: (height, width, 3) uint8, or (3, height, width) with numbers from 0 to 1, as an array or a tensor; a batch
-    axis of length 1 may come first. fit: how other sizes become the model's, see `CameraPicture`.
+    axis of length 1 may come first. size: None leaves the picture's own. fit: how other sizes become the model's, see
+    `CameraPicture`.
 
     Raises:
         BadArgument: another shape or type.
     """
     levels = _levels(picture, camera)
-    height, width = size
-    if levels.shape[:2] == (height, width):
+    if size is None or levels.shape[:2] == size:
         return levels, WHOLE
+    height, width = size
     if fit == "stretch":
         return _resized(levels, height, width), WHOLE
     part = fitted_part((levels.shape[0], levels.shape[1]), size, 1.0 if fit == "pad_left_top" else 0.5)

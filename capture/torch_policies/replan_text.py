@@ -71,7 +71,7 @@ class PromptIds:
 
     def _look(self, path: str, _module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
         given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
-        if given is None or given.is_floating_point():
+        if given is None or given.is_floating_point() or given.is_meta:
             return
         self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
         rows = given[None] if given.ndim == 1 else given

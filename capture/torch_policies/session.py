@@ -33,6 +33,7 @@ from vla_attention.capture.torch_policies.recorded_episodes import (
 from vla_attention.capture.torch_policies.repeated_calls import RepeatedPolicy
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
 from vla_attention.capture.torch_policies.replan_text import embeddings_of
+from vla_attention.capture.torch_policies.watch import noticing_modules
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
 
@@ -89,12 +90,15 @@ class RecordedRun:
     def __enter__(self) -> RecordedRun:
         self._store = open_run(self.path, self.attributes, self.mode, durable=self.durable)
         self.path = self._store.path
+        self._noticing = noticing_modules()
+        self._noticing.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._store = None
+        self._noticing.__exit__(kind, error, traceback)
 
     @property
     def store(self) -> RunStore:
@@ -242,6 +246,7 @@ class RecordedRun:
                 self.num_dropped += 1
                 for one in rows:
                     one.episode.num_dropped += 1
+                    one.episode.unmet = call.unmet
         finally:
             self._in_block = False
 

@@ -41,6 +41,9 @@ PRODUCTS = {
     torch.matmul, torch.bmm, Tensor.matmul, Tensor.bmm, Tensor.__matmul__, Tensor.__rmatmul__, torch.linalg.matmul,
     torch.ops.aten.matmul, torch.ops.aten.matmul.default, torch.ops.aten.bmm, torch.ops.aten.bmm.default, torch.einsum,
 }  # fmt: skip
+SELECTIONS = {
+    torch.topk, Tensor.topk, torch.sort, Tensor.sort, torch.argsort, Tensor.argsort, torch.kthvalue, Tensor.kthvalue,
+}  # fmt: skip
 #: Largest difference of a sum of probabilities from 1 that rounding to bfloat16 leaves, with room.
 _ROUNDING = 1e-2
 _ORDER_UNKNOWN = (
@@ -72,9 +75,10 @@ class _Softmax:
 
     logits: what it took; before: the same without the watcher's change. change: that one, (batch or 1, head or 1, query
     or 1, key or 1). reordered: whether what is followed went through a function that changes the order of keys, heads
-    or rows.
+    or rows. numbers: of this softmax among those of the block, and of others in it, as of a mean of two.
     """
 
+    numbers: tuple[int, ...]
     shape: CallShape
     logits: Tensor
     before: Tensor
@@ -103,7 +107,12 @@ class Softmaxes:
         #: Products of two activations, and what was computed of them alone.
         self._products: TensorTable[_Made] = TensorTable()
         #: Softmaxes that were changed and met no values yet.
-        self.changed: list[CallShape] = []
+        self.changed: set[int] = set()
+        #: All that met none yet, by their numbers, and the last function of what is followed.
+        self.unmet: dict[int, tuple[CallShape, str]] = {}
+        self._count = 0
+        #: Module and number of keys -> the function that selected some of them.
+        self._selected: dict[tuple[str, int], str] = {}
 
     def softmax(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a softmax, changed if the watcher says so, and follow its result."""
@@ -111,6 +120,7 @@ class Softmaxes:
         axis = args[1] if len(args) > 1 else kwargs.get("dim", kwargs.get("axis"))
         if not isinstance(logits, Tensor) or torch._C._functorch.is_functorch_wrapped_tensor(logits):
             return function(*args, **kwargs)
+        self._mode.refuse_without_numbers(logits)
         if not 3 <= logits.ndim <= 5 or axis not in (-1, logits.ndim - 1):
             return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
@@ -119,6 +129,7 @@ class Softmaxes:
         batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
         shape = self._mode.new_shape(path, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
         batch, heads = shape.batch, shape.heads
+        self._count += 1
         change, given = self._mode.change(shape), logits
         if change is None:
             result = function(*args, **kwargs)
@@ -130,9 +141,29 @@ class Softmaxes:
             check_change(logits.reshape(size), given.reshape(size), shape)
             name = "self" if "self" in kwargs else "input"
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
-            self.changed.append(shape)
-        self._followed.put(result, _Softmax(shape, given.detach(), logits.detach(), change))
+            self.changed.add(self._count)
+        self.unmet[self._count] = shape, "softmax"
+        self._followed.put(result, _Softmax((self._count,), shape, given.detach(), logits.detach(), change))
         return result
+
+    def select(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Run a function that selects numbers, which may be scores of keys."""
+        result = self.follow(function, args, kwargs)
+        for scores in tensors_among((*args, *kwargs.values())):
+            if scores.ndim > 2 and scores.is_floating_point():
+                self._selected[self._mode.where()[0], scores.shape[-1]] = function.__name__
+        return result
+
+    def selects(self, shape: CallShape) -> str:
+        """Return the function by which the module of a call, or one in it, selected some of its keys; "" for none."""
+        return next(
+            (
+                function
+                for (path, keys), function in self._selected.items()
+                if keys == shape.keys and f"{path}.".startswith(f"{shape.module}." if shape.module else "")
+            ),
+            "",
+        )
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run any other function, and follow what comes of a softmax's result."""
@@ -143,6 +174,7 @@ class Softmaxes:
             softmax = self._followed.get(given)
             if softmax is None:
                 continue
+            self.unmet.update(dict.fromkeys(self.unmet.keys() & softmax.numbers, (softmax.shape, name)))
             if function in PRODUCTS:
                 self._beside.put(result, softmax)
                 self._product(function, args, kwargs, given, softmax, result)
@@ -154,7 +186,9 @@ class Softmaxes:
                 fewer = result.ndim == given.ndim and sum(a != b for a, b in zip(result.shape, given.shape)) == 1  # noqa: B905
                 if result.numel() == given.numel() or (fewer and result.numel() < given.numel()):
                     reordered = softmax.reordered or _reorders(name, args)
-                    self._followed.put(result, replace(softmax, reordered=reordered))
+                    others = [other for tensor in tensors if (other := self._followed.get(tensor)) is not None]
+                    numbers = tuple({number for other in others for number in other.numbers})
+                    self._followed.put(result, replace(softmax, reordered=reordered, numbers=numbers))
                 else:
                     self._beside.put(result, softmax)
             break
@@ -195,8 +229,9 @@ class Softmaxes:
         )  # fmt: skip
         if product is None:
             return
-        if softmax.shape in self.changed:
-            self.changed.remove(softmax.shape)
+        self.changed.difference_update(softmax.numbers)
+        for number in softmax.numbers:
+            self.unmet.pop(number, None)
         multiplied = given.detach().permute(product.rows)
         sizes, count, dim = _sizes(softmax, product, given), multiplied.shape[-1], value.shape[product.values[-1]]
         sinks = softmax.logits.shape[-1] - count

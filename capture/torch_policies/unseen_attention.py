@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 from torch import nn
 
+from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.schemas.errors import BadArgument, listing
 
 #: Operators that compute attention in a way that gives no rows, by their full names.
@@ -47,8 +48,8 @@ def refuse_unseen_settings(modules: Mapping[str, nn.Module]) -> None:
         )
 
 
-def no_attention(policy: object) -> str:
-    """Return the sentence about a policy in which no attention was seen."""
+def no_attention(policy: object, unmet: Mapping[int, tuple[CallShape, str]]) -> str:
+    """Return the sentence about a policy in which no attention was seen; unmet: see `Watcher`."""
     loaded = [package for package in _PACKAGES if package in sys.modules]
     reason = (
         f"{listing(loaded)} is loaded, whose kernels nothing sees. {LOAD_WITH_SDPA}"
@@ -57,4 +58,7 @@ def no_attention(policy: object) -> str:
         "answers from a queue computes attention only when the queue is empty, so reset it before the call. A softmax "
         "that is written with exp and sum, and functions of TorchScript, are not seen either."
     )
+    if unmet:
+        softmaxes = dict.fromkeys(f"{shape} (followed up to {function})" for shape, function in unmet.values())
+        reason = f"Softmaxes whose results met no values in a product: {listing(softmaxes, 4)}. {reason}"
     return f"The policy ({type(policy).__name__}) computed no attention that can be seen. {reason}"

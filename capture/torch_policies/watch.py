@@ -12,7 +12,7 @@ import threading
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -24,7 +24,7 @@ from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.fused_calls import FLEX_FUNCTIONS, SDPA_FUNCTIONS, watch_flex, watch_sdpa
 from vla_attention.capture.torch_policies.output_ways import OutputWay, OutputWays
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
-from vla_attention.capture.torch_policies.softmax_calls import PRODUCTS, SOFTMAXES, Softmaxes
+from vla_attention.capture.torch_policies.softmax_calls import PRODUCTS, SELECTIONS, SOFTMAXES, Softmaxes
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
 from vla_attention.schemas.errors import BadArgument, UserError
 
@@ -64,12 +64,14 @@ class AttentionMode(TorchFunctionMode):
         self._policy, self._watcher = known.policy, watcher
         self._paths = {id(module): path for path, module in known.modules.items()}
         self._softmaxes = Softmaxes(self)
+        watcher.unmet = self._softmaxes.unmet
         self.outputs = OutputWays(lambda: f"module '{self.where()[0]}'", self.computing)
         self._handlers: dict[Any, Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]] = {
             **dict.fromkeys(SDPA_FUNCTIONS, lambda *call: watch_sdpa(self, *call)),
             **dict.fromkeys(FLEX_FUNCTIONS, lambda *call: watch_flex(self, *call)),
             **dict.fromkeys(SOFTMAXES, self._softmaxes.softmax),
             **dict.fromkeys(PRODUCTS, self._softmaxes.follow),
+            **dict.fromkeys(SELECTIONS, self._softmaxes.select),
         }
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self._error: BaseException | None = None
@@ -166,7 +168,17 @@ class AttentionMode(TorchFunctionMode):
         if not self._watcher.changes:
             return None
         with torch.no_grad(), self._failing():
-            return self._watcher.change(shape)
+            change = self._watcher.change(shape)
+        selects = self._softmaxes.selects(shape)
+        if change is not None and selects and bool(change.any()):
+            raise self.failed(
+                ChangeRefused(
+                    f"The attention call {shape} cannot be changed: {selects} selects keys by their scores first, and "
+                    "without a key it would select another one. Leave this call out (layers), or record the policy "
+                    "with all keys."
+                )
+            )
+        return change
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is none of the watcher's, and count it then."""
@@ -199,8 +211,8 @@ class AttentionMode(TorchFunctionMode):
         with exact(), self._failing(), _without_modes():
             yield
 
-    def refuse_nested(self, *tensors: Tensor) -> None:
-        """Raise `UnseenAttention` for nested tensors, whose sequences have lengths of their own, and inside of vmap."""
+    def refuse_without_numbers(self, *tensors: Tensor) -> None:
+        """Raise `UnseenAttention` for nested tensors, inside of vmap, and on the meta device."""
         reason = ""
         if any(torch._C._functorch.is_functorch_wrapped_tensor(tensor) for tensor in tensors):
             reason = (
@@ -209,6 +221,8 @@ class AttentionMode(TorchFunctionMode):
             )
         elif any(tensor.is_nested for tensor in tensors):
             reason = "of nested tensors, whose rows cannot be recorded. Call the policy with padded tensors and a mask."
+        elif any(tensor.is_meta for tensor in tensors):
+            reason = "on the meta device, whose tensors have no numbers. Load the weights, and move the inputs to them."
         if reason:
             raise self.failed(UnseenAttention(f"{self.where()[0] or 'The policy'} computes attention {reason}"))
 
@@ -225,36 +239,23 @@ class AttentionMode(TorchFunctionMode):
             self.failed(error)
             raise
 
-    @contextmanager
-    def noticing_threads(self) -> Iterator[None]:
-        """Notice the policy's modules that run, in another thread too, whose functions this mode does not see.
-
-        torch's global hooks would make every module slower, and torch.compile warn.
-        """
-        call = nn.Module.__call__
-
-        def noticed(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
-            if id(module) in self._paths:
-                self._watcher.modules.add(id(module))
-                if threading.get_ident() != self._thread:
-                    self._ran_elsewhere = True
-            return call(module, *args, **kwargs)
-
-        nn.Module.__call__ = noticed  # type: ignore[method-assign]
-        try:
-            yield
-        finally:
-            nn.Module.__call__ = call  # type: ignore[method-assign]
+    def notice(self, module: nn.Module) -> None:
+        """Notice that a module runs: of the policy, or in a thread whose functions this mode does not see."""
+        if id(module) in self._paths:
+            self._watcher.modules.add(id(module))
+            if threading.get_ident() != self._thread:
+                self._ran_elsewhere = True
 
     def close(self) -> None:
         """End a block whose code raised nothing; errors: see `watch_attention`, also those that the policy caught."""
         if self._error is not None:
             raise self._error
         if self._softmaxes.changed:
+            shape, last = self._softmaxes.unmet[min(self._softmaxes.changed)]
             raise ChangeRefused(
-                f"A softmax that is no attention was changed as if it were the call {self._softmaxes.changed[0]}: it "
-                "was multiplied with no values, as the gate of a mixture of experts. Give the layout's rule a kind or "
-                "a number of keys that this softmax does not have, or leave its block out."
+                f"A softmax was changed as if it were the call {shape}, and met no values (last function: {last}): it "
+                "is no attention, as the gate of a mixture of experts, or attention that is not seen. Give the "
+                "layout's rule a kind or a number of keys that this softmax does not have, or leave its block out."
             )
         if self._ran_elsewhere:
             raise NotFollowed(
@@ -288,11 +289,54 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
         )
     try:
         mode = AttentionMode(known_policy, watcher)
-        with seen_by_python(), mode.noticing_threads(), mode:
-            yield
+        with seen_by_python(), noticing_modules(), mode:
+            _NOTICING.mode = mode
+            try:
+                yield
+            finally:
+                _NOTICING.mode = None
         mode.close()
     finally:
         _ACTIVE.release()
+
+
+@dataclass
+class _Noticing:
+    """Who is told of modules that run. blocks: how many hold `nn.Module.__call__`, which calls as `plain` does."""
+
+    mode: AttentionMode | None = None
+    blocks: int = 0
+    plain: Callable[..., Any] = nn.Module.__call__
+    noticed: Callable[..., Any] | None = None
+
+
+_NOTICING = _Noticing()
+
+
+@contextmanager
+def noticing_modules() -> Iterator[None]:
+    """Tell the mode that watches of every module that runs.
+
+    torch's global hooks would make every module slower, and torch.compile warn. Hold this around many watched blocks:
+    the class of all modules is written to at the first and at the end of the last one, and Python (3.13) looks
+    attributes up more slowly in a class that was written to a thousand times.
+    """
+    if not _NOTICING.blocks:
+        plain = _NOTICING.plain = nn.Module.__call__
+
+        def noticed(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
+            if _NOTICING.mode is not None:
+                _NOTICING.mode.notice(module)
+            return plain(module, *args, **kwargs)
+
+        nn.Module.__call__ = _NOTICING.noticed = noticed  # type: ignore[method-assign]
+    _NOTICING.blocks += 1
+    try:
+        yield
+    finally:
+        _NOTICING.blocks -= 1
+        if not _NOTICING.blocks and nn.Module.__call__ is _NOTICING.noticed:  # and nobody else has written to it
+            nn.Module.__call__ = _NOTICING.plain  # type: ignore[method-assign]
 
 
 @contextmanager

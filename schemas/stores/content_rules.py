@@ -294,17 +294,22 @@ def _holds(span: Span, piece: Piece) -> bool:
 
 
 def _camera_problems(block: Block) -> Iterator[str]:
-    """Pictures or coverage: of a camera that has patches at some site."""
-    cameras = dict.fromkeys(camera for site in block.root.sites for camera in site.pictured)
-    if block.name.partition("/")[2] not in cameras:
+    """Pictures: of a camera of some site; coverage: of one that has patches there."""
+    group, _, name = block.name.partition("/")
+    of_patches = group == "objects"
+    cameras = dict.fromkeys(
+        name for site in block.root.sites for name in (site.pictured if of_patches else site.cameras)
+    )
+    if name not in cameras:
         yield f"{block.name} is of a camera that no site has; existing: {listing(cameras)}"
 
 
 def _picture_problems(block: Block) -> Iterator[str]:
-    """Pictures (replan, row, column, channel): the model's are of the size that its patches tile, others of any."""
+    """Pictures (replan, row, column, channel): of the size that the camera's patches tile; without any, of any size."""
     yield from _camera_problems(block)
     group, _, camera = block.name.partition("/")
-    size = picture_size(block.root.sites, camera) if group == "frames" else block.values.shape[1:3]
+    tiled = group == "frames" and any(camera in site.pictured for site in block.root.sites)
+    size = picture_size(block.root.sites, camera) if tiled else block.values.shape[1:3]
     yield from shape_problems(block.name, block.values.shape, (len(block.values), *size, 3))
 
 

@@ -116,3 +116,11 @@ def test_one_of_six_kinds_that_is_heard_is_found():
 def test_what_cannot_be_tested(call, inputs, prompts):
     with pytest.raises(BadArgument):
         va.language_test(call, inputs, prompts)
+
+
+@pytest.mark.parametrize(
+    "inputs", [["go left", "go left"], [1.0, 2.0], [(1.0, "go left", 0), (2.0, "go left", 0)], [(1.0,)]]
+)
+def test_inputs_that_are_no_pairs_are_refused(inputs):
+    with pytest.raises(BadArgument, match="pair"):
+        va.language_test(hears(0.0), inputs, KINDS)

@@ -334,6 +334,8 @@ def linear_part(add: Add) -> Part:
     return part
 
 
+ORDER, FIRST = torch.tensor([2, 0, 1, 3]), (torch.arange(ACTIONS) == 0)[None, :, None]
+
 #: Further ways, all linear: other layers on the way, sums that are not the residual stream, and several ways.
 _LINEAR: dict[str, Add] = {
     "adaLN in one function": lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)),
@@ -359,6 +361,21 @@ _LINEAR: dict[str, Add] = {
         lambda b, c: c.stream + (lambda update: update - update.mean(-1, keepdim=True))(b.out(c.mixed))
     ),
     "gate of zero": lambda b, c: c.stream + 0 * b.out(c.mixed),
+    "clamped far away": lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100),
+    "sum that is clamped": lambda b, c: (c.stream + b.out(c.mixed)).clamp(-100, 100),
+    "without NaN": lambda b, c: c.stream + torch.nan_to_num(b.out(c.mixed)),
+    "where": lambda b, c: c.stream + torch.where(FIRST, b.out(c.mixed), c.normed),
+    "masked fill": lambda b, c: c.stream + b.out(c.mixed).masked_fill(FIRST, 0.5),
+    "masked fill in place": lambda b, c: c.stream + b.out(c.mixed).masked_fill_(FIRST, 0.5),
+    "index_add": lambda b, c: c.stream.index_add(1, ORDER, b.out(c.mixed), alpha=0.5),
+    "index_add onto one": lambda b, c: c.stream.index_add(1, 0 * ORDER, b.out(c.mixed)),
+    "index_add in place": lambda b, c: c.stream.clone().index_add_(1, ORDER, b.out(c.mixed)),
+    "index_copy": lambda b, c: c.stream + torch.zeros_like(c.stream).index_copy(1, ORDER, b.out(c.mixed)),
+    "addmm": lambda b, c: torch.addmm(c.stream[0], c.mixed[0], b.out.weight.T, beta=0.9, alpha=1.1)[None],
+    "baddbmm": lambda b, c: torch.baddbmm(c.stream, c.mixed, b.out.weight.T[None]),
+    "lerp": lambda b, c: torch.lerp(c.stream, b.out(c.mixed), 0.4),
+    "stack and sum": lambda b, c: torch.stack([c.stream, b.out(c.mixed)]).sum(0),
+    "stack and mean": lambda b, c: torch.stack([b.out(c.mixed), c.normed, c.stream], dim=2).mean(dim=2),
 }
 WAYS |= {name: Way(add, linear_part(add)) for name, add in _LINEAR.items()}
 
@@ -382,7 +399,10 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
         lambda b, c: c.stream + chunk(b, c, 2) * (c.branch + b.out(c.mixed)),
         "adds a multiple of a sum with",
     ),
-    "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100), "clamp"),
+    "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-0.1, 0.1), "clamp"),
+    "where it is positive": (lambda b, c: (lambda u: c.stream + torch.where(u > 0, u, 0 * u))(b.out(c.mixed)), ""),
+    "lerp by a gate of it": (lambda b, c: (lambda u: torch.lerp(c.stream, u, u.sigmoid()))(b.out(c.mixed)), ""),
+    "stack and largest": (lambda b, c: torch.stack([c.stream, b.out(c.mixed)]).amax(0), ""),
     "projected inside of vmap": (lambda b, c: c.stream + torch.vmap(b.out)(c.mixed), "added to no tensor"),
     "squared": (lambda b, c: c.stream + b.out(c.mixed) ** 2, "pow"),
     "no residual stream": (lambda b, c: b.out(c.mixed), "gelu"),

@@ -262,8 +262,8 @@ def test_a_padding_id_among_those_that_are_skipped_is_no_padding_on_the_left(tmp
         policy.act(["pick the bowl"])
 
 
-@pytest.mark.parametrize("what", ["frames", "masks", "coverage"])
-def test_a_picture_of_a_camera_without_patches_has_no_size(tmp_path, what):
+@pytest.mark.parametrize("what", ["masks", "coverage"])
+def test_nothing_covers_a_camera_without_patches(tmp_path, what):
     layout = padded_layout(None)
     pooled = va.Span("image_front", "image", 0, 4, "front")
     site = replace(layout.sites[0], keys=replace(layout.sites[0].keys, spans=(pooled, layout.sites[0].keys.spans[1])))

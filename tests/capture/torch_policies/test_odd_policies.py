@@ -10,6 +10,7 @@ import pytest
 import torch
 from msgspec.structs import replace
 from torch import Tensor, nn
+from torch.nn.attention.bias import causal_lower_right, causal_upper_left
 
 from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.torch_policies.attention_calls import RowsRefused
@@ -21,7 +22,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import ContributionsUnknown, WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
@@ -373,6 +374,70 @@ def test_a_knockout_leaves_no_query_with_masked_keys_alone(tmp_path):
 
     with pytest.raises(QueryWithoutKeys):
         rows_of(tmp_path, OddPolicy(attend), cut="* - patch:front[1:2,0:1]")
+
+
+def two_softmaxes(block, q, k, v):
+    rows = (torch.softmax(logits(q, k), dim=-1) + torch.softmax(2 * logits(q, k), dim=-1)) / 2
+    return rows @ v
+
+
+@pytest.mark.parametrize("cut", [None, "role:state"])
+def test_a_mean_of_two_softmaxes(tmp_path, cut):
+    policy = OddPolicy(two_softmaxes)
+    rows, _ = rows_of(tmp_path, policy, cut=cut)
+    kept = torch.stack([block.kept[0] for block in policy.blocks])
+    kept[..., 4 : 6 if cut else 4] = -math.inf
+    np.testing.assert_allclose(rows, (kept.softmax(-1) + (2 * kept).softmax(-1)).numpy() / 2, atol=2e-6)
+
+
+def best_by_hand(block, q, k, v):
+    scores = logits(q, k)
+    return torch.softmax(scores.masked_fill(scores < scores.topk(5).values[..., -1:], -math.inf), dim=-1) @ v
+
+
+def best_by_sdpa(block, q, k, v):
+    scores = logits(q, k)
+    chosen = scores >= scores.sort(-1, descending=True).values[..., 4:5]
+    return nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=chosen)
+
+
+@pytest.mark.parametrize("attend", [best_by_hand, best_by_sdpa])
+def test_keys_that_are_selected_by_their_scores_are_recorded_and_not_cut(tmp_path, attend):
+    policy = OddPolicy(attend)
+    rows, result = rows_of(tmp_path / "rows", policy)
+    assert torch.equal(result, policy.act())
+    kept = torch.stack([block.kept[0] for block in policy.blocks])
+    best = kept.masked_fill(kept < kept.topk(5).values[..., -1:], -math.inf)
+    np.testing.assert_allclose(rows, best.softmax(-1).numpy(), atol=2e-6)
+    with pytest.raises(ChangeRefused):
+        rows_of(tmp_path / "cut", policy, cut="role:state")
+
+
+@pytest.mark.parametrize(("bias", "diagonal"), [(causal_lower_right, KEYS - ACTIONS), (causal_upper_left, 0)])
+@pytest.mark.parametrize("cut", [None, "role:image & keys:1-2"])
+def test_causal_biases_of_torch(tmp_path, bias, diagonal, cut):
+    def attend(block, q, k, v):
+        return nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=bias(ACTIONS, KEYS))
+
+    policy = OddPolicy(attend)
+    own = policy.act()
+    rows, result = rows_of(tmp_path, policy, cut=cut)
+    assert torch.equal(result, own) == (cut is None)
+    kept = torch.stack([block.kept[0] for block in policy.blocks])
+    kept = kept.masked_fill(torch.ones(ACTIONS, KEYS).triu(diagonal + 1).bool(), -math.inf)
+    kept[..., 1 : 3 if cut else 1] = -math.inf
+    np.testing.assert_allclose(rows, kept.softmax(-1).numpy(), atol=2e-6)
+
+
+def test_softmaxes_that_met_no_values_are_listed(tmp_path):
+    def attend(block, q, k, v):
+        rows = torch.softmax(logits(q, k), dim=-1)
+        return torch.cat([rows[:, :, :2], rows[:, :, 2:]], dim=2) @ v
+
+    policy = OddPolicy(attend)
+    for refused in (lambda: rows_of(tmp_path, policy), lambda: inspect(policy, policy.act)):
+        with pytest.raises(UserError, match=r"blocks\.0: softmax, 3 x 9.*cat"):
+            refused()
 
 
 SPELLINGS = {

@@ -29,11 +29,13 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
+from vla_attention.capture.torch_policies.layout_check import check_layout
 from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion, PromptText
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
+from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.capture.torch_policies.watch import NotFollowed
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -485,3 +487,49 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path, policy, where):
         episode.replan(env_step=3) as replan,
     ):
         replan.actions = policy.act(**inputs) * (torch.nan if where == "actions" else 1)
+
+
+def test_a_camera_of_latents_without_a_grid_may_have_pictures(tmp_path, policy):
+    (joint,) = small_layout().sites
+    image, *others = joint.keys.spans
+    site = replace(joint, keys=replace(joint.keys, spans=(replace(image, grid=None), *others)))
+    picture = np.random.default_rng(0).integers(0, 256, (12, 20, 3), dtype=np.uint8)
+    with start(tmp_path, policy, layout=small_layout(sites=(site,)), frames=True) as run:
+        with pytest.raises(BadArgument):
+            one_call(run, policy, masks={"front": np.zeros((12, 20), int)})
+        one_call(run, policy, frames={"front": picture})
+    np.testing.assert_array_equal(stored(tmp_path).episodes[0].read("frames/front")[0], picture)
+
+
+@pytest.mark.parametrize("layout", [None, "small"])
+def test_what_is_no_layout_is_refused(tmp_path, policy, layout):
+    with pytest.raises(BadArgument):
+        start(tmp_path, policy, layout=layout)
+    with pytest.raises(BadArgument):
+        check_layout(policy, lambda: policy.act(**given()), layout, {"span:state": lambda: policy.act(**given())})
+
+
+def test_the_meta_device_has_no_numbers(tmp_path):
+    with torch.device("meta"):
+        policy = SmallPolicy()
+        inputs = {
+            name: value.to("meta") if isinstance(value, torch.Tensor) else value for name, value in given().items()
+        }
+        with start(tmp_path, policy) as run, pytest.raises(UnseenAttention):
+            one_call(run, policy, inputs)
+
+
+def test_the_class_of_modules_is_written_to_once_a_run(tmp_path, policy):
+    """Python (3.13) looks attributes up more slowly in a class that was written to a thousand times."""
+    plain, seen = nn.Module.__call__, set()
+    with start(tmp_path, policy) as run:
+        for number in range(2):
+            with run.episode(task_id=0, episode_index=number, instruction="pick the bowl") as episode:
+                for step in range(2):
+                    with episode.replan(env_step=step):
+                        seen.add(nn.Module.__call__)
+                        policy.act(**given())
+                    seen.add(nn.Module.__call__)
+    assert len(seen) == 1
+    assert plain not in seen
+    assert nn.Module.__call__ is plain
