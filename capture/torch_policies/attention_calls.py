@@ -125,6 +125,12 @@ class AttentionCall:
             return self.allowed_of(queries)
 
     @property
+    def heads_may_be_queries(self) -> bool:
+        """Whether nothing in a product by hand tells the two: as many of both, and heads that share their values."""
+        shape = self.shape
+        return shape.kind == "softmax" and 1 < shape.heads == shape.queries and self.values.shape[1] < shape.heads
+
+    @property
     def precision(self) -> str:
         """The least precise dtype of what is multiplied and of its result: a softmax may be of higher precision."""
         dtypes = [self.value.dtype, self.output.dtype, getattr(torch, self.shape.dtype)]

@@ -101,7 +101,8 @@ class OutputWay:
         taken: what was kept, of each sum that may be the residual stream.
         nothing: what was kept where the recorded queries are not in a sum: other tokens', or behind a gate of 0.
         lost: why it is not known what is added; "" where nothing stands against it.
-        mixes_rows: whether what one row of the batch gave is added to others.
+        mixes_rows: whether what one row of the batch gave is added to others. turned: whether heads and queries of the
+            call are exchanged.
         found: whether the residual stream is known; it is the last of `taken` then.
         changed: what was done to it first that is not linear, as "module 'x' computes tanh of".
         carried, bent: the numbers of the sums that reached another sum as they are or behind a norm, and by a function
@@ -115,6 +116,7 @@ class OutputWay:
     nothing: Any = field(default=None, init=False)
     lost: str = field(default="", init=False)
     mixes_rows: bool = field(default=False, init=False)
+    turned: bool = field(default=False, init=False)
     found: bool = field(default=False, init=False)
     changed: str = field(default="", init=False)
     carried: set[int] = field(default_factory=set, init=False)
@@ -147,12 +149,12 @@ class OutputWay:
 class NotReplayed(Exception):
     """A replay that gives something else than what the policy computed; the message says what.
 
-    mixes_rows: rows of the batch add to one another's.
+    mixes_rows: rows of the batch add to one another's. turned: heads and queries are exchanged.
     """
 
-    def __init__(self, message: str, *, mixes_rows: bool = False) -> None:
+    def __init__(self, message: str, *, mixes_rows: bool = False, turned: bool = False) -> None:
         super().__init__(message)
-        self.mixes_rows = mixes_rows
+        self.mixes_rows, self.turned = mixes_rows, turned
 
 
 @dataclass(frozen=True)
@@ -319,7 +321,7 @@ class OutputWays:
             try:
                 taken, there = way.take(of_added, added.detach())
             except NotReplayed as error:
-                way.lost, way.mixes_rows = str(error), error.mixes_rows
+                way.lost, way.mixes_rows, way.turned = str(error), error.mixes_rows, error.turned
             except (RuntimeError, TypeError, ValueError, IndexError) as error:
                 way.lost = f"what the policy does with it cannot be computed again ({error})"
         if way.lost:

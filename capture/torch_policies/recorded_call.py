@@ -17,7 +17,7 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
-from vla_attention.capture.torch_policies.attention_calls import CallShape
+from vla_attention.capture.torch_policies.attention_calls import CallShape, RowsRefused
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.own_setting import BatchRowsMixed
@@ -82,6 +82,7 @@ class WatchedCall(ReplanRecorder):
         self._ids = PromptIds(run._embeddings, batch)
         inputs = {one.row: one.inputs for one in calls}
         self._text = ReplanText(run.layout, run.tokenizer, self._ids, inputs, self.present)
+        self.asks_of_axes = not run._asked_of_axes
         self._asks_of_batch = self.asks_of_batch = batch > 1 and not run._asked_of_batch
         #: Of a row of the batch, what changes it: asked at its first call.
         self._bias_of = cache(self._row_bias)
@@ -115,8 +116,16 @@ class WatchedCall(ReplanRecorder):
 
         Raises:
             BatchRowsMixed: the rows of the batch are not those of the environments.
+            RowsRefused: heads and queries are exchanged.
         """
         rows_of_sites = super().finish()
+        if self.contributions.turned:
+            raise RowsRefused(
+                "The rows have heads for queries, and queries for heads: the policy's softmax is over (batch, query, "
+                "head, key), with as many queries as heads, which share their values. Compute it over (batch, head, "
+                "query, key)."
+            )
+        self._run._asked_of_axes = self._run._asked_of_axes or not self.asks_of_axes
         if self._asks_of_batch:
             self._check_batch()
         return rows_of_sites

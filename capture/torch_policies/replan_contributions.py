@@ -88,6 +88,8 @@ class ReplanContributions:
 
         mixed: of each row, (part, head, query, dim). added: what the policy added.
         """
+        if call.heads_may_be_queries:
+            self._check_axes(call, mixed[0].sum(dim=0), queries, replay)
         shape, most = call.shape, max(len(parts) for parts in mixed)
         # The last one is nothing: what is added whatever the attention gives. The last but one tells rows apart.
         given = mixed[0].new_zeros(most + 2, shape.batch, shape.heads, shape.queries, mixed[0].shape[-1])
@@ -123,6 +125,25 @@ class ReplanContributions:
             vectors = torch.cat([each[: len(parts), of_row], total[None, of_row]]).flatten(1)
             grams.append(vectors @ vectors.T / count)
         return grams, bool(places.any()) or not any(bool(parts.any()) for parts in mixed)
+
+    def _check_axes(self, call: AttentionCall, mixed: Tensor, queries: slice, replay: Replay) -> None:
+        """Raise `NotReplayed` if a query of a call goes to more tokens than a head does: they are exchanged then.
+
+        mixed: (head, query, dim) of the first row.
+        """
+        shape, row = call.shape, self._rows[0]
+        given = mixed.new_zeros(3, shape.batch, shape.heads, shape.queries, mixed.shape[-1])
+        given[0, row, :, queries.indices(shape.queries)[0]] = mixed[:, 0]
+        given[1, row, 0, queries] = mixed[0]
+        made = torch.vmap(lambda output: replay(call.laid_out(output)))(given).flatten(1, -2)
+        of_query, of_head = ((made[:2] - made[2]).abs().amax(dim=-1) > 0).sum(dim=1).tolist()
+        if of_query > of_head:
+            raise NotReplayed("its heads and queries are exchanged, as the tokens show to which they go", turned=True)
+
+    @property
+    def turned(self) -> bool:
+        """Whether heads and queries of some call are exchanged."""
+        return any(way.turned for _, way in self._places)
 
     def rows_apart(self) -> bool | None:
         """Whether each row of the batch adds to its own tokens alone; None where that is not known."""

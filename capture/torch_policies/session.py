@@ -75,6 +75,8 @@ class RecordedRun:
     #: Whether it was asked if the rows of a batch are apart, and what stands in sentences where that is not known.
     _asked_of_batch: bool = field(default=False, init=False)
     _of_batch: str = field(default="", init=False)
+    #: Whether it was looked at whether heads and queries are exchanged.
+    _asked_of_axes: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         """Look for the policy's modules, and at its weights."""

@@ -85,6 +85,8 @@ class ReplanRecorder(CallOrder):
         self.largest_error = 0.0
         #: Whether the output of the first recorded call is followed to see whether the rows of the batch are apart.
         self.asks_of_batch = False
+        #: The same of the first call whose heads may be queries.
+        self.asks_of_axes = False
         self._changes: dict[tuple[int, ...], Tensor] = {}
         self._caches = KeyCaches()
         #: By site: rows, and what uniform attention gives in their place, for one head where it is the same for all.
@@ -184,8 +186,9 @@ class ReplanRecorder(CallOrder):
         rows, seen = torch.threshold(rows, NO_MASS, 0.0), call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
         way, by_part = None, recording.contributions
-        if by_part or self.asks_of_batch:
-            self.asks_of_batch = False
+        asks_of_axes = self.asks_of_axes and call.heads_may_be_queries
+        if by_part or self.asks_of_batch or asks_of_axes:
+            self.asks_of_batch, self.asks_of_axes = False, self.asks_of_axes and not asks_of_axes
             way = self.contributions.way(call, rows, place, site, cell, by_part=by_part)
         if place.keys is not None:
             keys, count = torch.from_numpy(place.keys).to(rows.device), site.keys.num_keys

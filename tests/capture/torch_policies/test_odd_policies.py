@@ -281,6 +281,27 @@ def test_a_knockout_hits_the_heads_and_queries_that_it_names(tmp_path, attend, h
     np.testing.assert_allclose(rows, kept.softmax(-1).numpy(), atol=2e-6)
 
 
+@pytest.mark.parametrize("contributions", [True, False])
+@pytest.mark.parametrize("turned", [False, True])
+def test_heads_that_share_values_are_no_queries(tmp_path, contributions, turned):
+    """Nothing in the products tells heads from queries, if there are as many; the tokens that they go to do."""
+    order = "bqhk" if turned else "bhqk"
+
+    def attend(block, q, k, v):
+        block.kept = logits(q, k[:, :1])
+        scores = torch.einsum(f"bhqd,bkd->{order}", q, k[:, 0]) / math.sqrt(DIM)
+        return torch.einsum(f"{order},bkd->bhqd", torch.softmax(scores, dim=-1), v[:, 0])
+
+    policy, shape = OddPolicy(attend, heads=ACTIONS), layout(num_heads=ACTIONS)
+    if turned:
+        with pytest.raises((RowsRefused, ContributionsUnknown)):
+            rows_of(tmp_path, policy, shape=shape, contributions=contributions)
+        return
+    rows, result = rows_of(tmp_path, policy, shape=shape, contributions=contributions)
+    assert torch.equal(result, policy.act())
+    np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
+
+
 def test_a_knockout_of_some_queries_is_refused_where_they_may_be_heads(tmp_path):
     sites = tuple(replace(site, action_queries=(-2, None)) for site in layout().sites)
     shape = layout(num_heads=ACTIONS, sites=sites)
@@ -427,6 +448,55 @@ def test_causal_biases_of_torch(tmp_path, bias, diagonal, cut):
     kept = kept.masked_fill(torch.ones(ACTIONS, KEYS).triu(diagonal + 1).bool(), -math.inf)
     kept[..., 1 : 3 if cut else 1] = -math.inf
     np.testing.assert_allclose(rows, kept.softmax(-1).numpy(), atol=2e-6)
+
+
+def compiled(rows, v):
+    return torch.compile(lambda rows, v: rows @ v, backend="eager")(rows, v)
+
+
+#: Further ways to compute softmax(scores) v, with rows that are right, and with an error.
+SEEN = {
+    "float64": lambda s, v: (s.double().softmax(-1) @ v.double()).float(),
+    "dim by its number": lambda s, v: nn.functional.softmax(s, 3) @ v,
+    "the operator": lambda s, v: torch.ops.aten._softmax(s, -1, False) @ v,
+    "dropout of 0": lambda s, v: nn.functional.dropout(s.softmax(-1), 0.3, training=False) @ v,
+    "minus and plus": lambda s, v: (s.softmax(-1) - 1 / KEYS + 1 / KEYS) @ v,
+    "renormalised": lambda s, v: (s.softmax(-1) / s.softmax(-1).sum(-1, keepdim=True)) @ v,
+    "a head left out": lambda s, v: (s.softmax(-1) @ v) * torch.tensor([1.0, 0.0]).view(1, -1, 1, 1),
+    "compiled product": lambda s, v: compiled(s.softmax(-1), v),
+    "gate of features": lambda s, v: s.softmax(-1) @ v + 0 * v[:, :, :ACTIONS].softmax(-1),
+}
+NOT_SEEN = {
+    "log": lambda s, v: s.log_softmax(-1).exp() @ v,
+    "exp and sum": lambda s, v: s.exp() @ v / s.exp().sum(-1, keepdim=True),
+    "parts of the queries": lambda s, v: torch.cat([part.softmax(-1) @ v for part in s.split(2, 2)], 2),
+    "parts of the queries in one": lambda s, v: torch.cat([part.softmax(-1) for part in s.split(2, 2)], 2) @ v,
+    "three operands": lambda s, v: torch.einsum("bhqk,bhkd,de->bhqe", s.softmax(-1), v, torch.eye(DIM)),
+    "vmap": lambda s, v: torch.vmap(lambda s, v: s.softmax(-1) @ v, in_dims=1, out_dims=1)(s, v),
+    "mask without a sum of 1": lambda s, v: (s.softmax(-1) * (torch.arange(KEYS) != 2)) @ v,
+    "heads side by side": lambda s, v: (
+        s.permute(0, 2, 1, 3).flatten(2).softmax(-1).view(1, ACTIONS, HEADS, KEYS).transpose(1, 2) @ v
+    ),
+    "accumulated": lambda s, v: torch.baddbmm(torch.zeros(HEADS, ACTIONS, DIM), s.softmax(-1)[0], v[0])[None],
+    "mixed heads": lambda s, v: torch.einsum("bhqk,hg->bgqk", s.softmax(-1), torch.ones(HEADS, HEADS) / HEADS) @ v,
+    "with a table": lambda s, v: (s.softmax(-1) + torch.full_like(s, 1 / KEYS)) / 2 @ v,
+}
+
+
+@pytest.mark.parametrize("way", SEEN.values(), ids=SEEN)
+@pytest.mark.parametrize("cut", [None, "role:state"])
+def test_ways_that_are_seen(tmp_path, way, cut):
+    policy = OddPolicy(lambda block, q, k, v: way(logits(q, k), v))
+    own = policy.act()
+    rows, result = rows_of(tmp_path, policy, cut=cut, contributions=False)
+    assert torch.equal(result, own) == (cut is None)
+    np.testing.assert_allclose(rows, expected(policy, (4, 5) if cut else ()), atol=2e-6)
+
+
+@pytest.mark.parametrize("way", NOT_SEEN.values(), ids=NOT_SEEN)
+def test_ways_that_are_refused(tmp_path, way):
+    with pytest.raises(UserError):
+        rows_of(tmp_path, OddPolicy(lambda block, q, k, v: way(logits(q, k), v)))
 
 
 def test_softmaxes_that_met_no_values_are_listed(tmp_path):
