@@ -24,7 +24,8 @@ from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.fused_calls import FLEX_FUNCTIONS, SDPA_FUNCTIONS, watch_flex, watch_sdpa
 from vla_attention.capture.torch_policies.output_ways import OutputWay, OutputWays
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
-from vla_attention.capture.torch_policies.softmax_calls import PRODUCTS, SELECTIONS, SOFTMAXES, Softmaxes
+from vla_attention.capture.torch_policies.products import PRODUCTS
+from vla_attention.capture.torch_policies.softmax_calls import SELECTIONS, SOFTMAXES, Softmaxes
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
 from vla_attention.schemas.errors import BadArgument, UserError
 
