@@ -167,7 +167,7 @@ class _Step:
         is_sum: whether it is the last of them, and not something computed of it.
         projected: whether a matrix product stands on its way, from the last sum on.
         factor: whether it is made of numbers such as those by which a norm divides.
-        stacked: whether other tensors as large stand beside it on an axis.
+        stacked: how many numbers each of the tensors has that stand beside one another in it; 0 where none do.
         goes_on: whether it is the last of the sums behind norms, or written into another tensor.
     """
 
@@ -177,7 +177,7 @@ class _Step:
     projected: bool = False
     factor: bool = False
     goes_on: bool = False
-    stacked: bool = False
+    stacked: int = 0
 
 
 _Steps = Sequence[tuple[Tensor, _Step]]
@@ -232,7 +232,9 @@ class OutputWays:
             self._lose(way, "writes over a part of a sum with")
         elif call.name in _SUMS:
             self._add(way, call, steps, results[0])
-        elif call.name in _SUMS_OF_STACKS and any(step.stacked for _, step in steps) and results[0].shape:
+        elif (call.name in _SUMS_OF_STACKS and steps[0][1].stacked == results[0].numel()) or (
+            call.name in _CHOICES and any(step.is_sum for _, step in steps)
+        ):
             self._sum(way, call, steps, results[0])
         else:
             sums = _sums(steps)
@@ -240,9 +242,9 @@ class OutputWays:
             replay = self._replay(call, steps)
             if replay is not None:
                 is_sum = call.name in _COPIES | _FOLDS | _RANGES | _WRITES and any(step.is_sum for _, step in steps)
-                stacked = (call.name in _FOLDS and steps[0][1].stacked) or (
-                    call.name in _STACKS and len(list(used_tensors(call.name, call.args, call.kwargs))) > len(steps)
-                )
+                stacked = steps[0][1].stacked if call.name in _FOLDS else 0
+                if call.name in _STACKS and len(list(used_tensors(call.name, call.args, call.kwargs))) > len(steps):
+                    stacked = steps[0][0].numel()
                 for position, result in enumerate(results):
                     picked = replay if isinstance(call.result, Tensor) else _picked(replay, position)
                     self._put([result], way, _Step(picked, sums, is_sum, projected, stacked=stacked))
@@ -306,7 +308,7 @@ class OutputWays:
             self._lose(way)
             return
         of_added, added = replay, result
-        if len(steps) == 1 and call.name in _SUMS - _FUSED_SUMS:
+        if len(steps) == 1 and call.name in _SUMS - _FUSED_SUMS and steps[0][0].shape == result.shape:
             # What is added is compared, for the stream may be many times as large.
             tensor, step = steps[0]
             factor = 1 if call.args[:1] and call.args[0] is tensor else call.kwargs.get("alpha", 1)

@@ -373,6 +373,11 @@ _LINEAR: dict[str, Add] = {
     "index_copy": lambda b, c: c.stream + torch.zeros_like(c.stream).index_copy(1, ORDER, b.out(c.mixed)),
     "addmm": lambda b, c: torch.addmm(c.stream[0], c.mixed[0], b.out.weight.T, beta=0.9, alpha=1.1)[None],
     "baddbmm": lambda b, c: torch.baddbmm(c.stream, c.mixed, b.out.weight.T[None]),
+    "where of the sum": lambda b, c: torch.where(c.normed > 0, c.stream + b.out(c.mixed), c.stream),
+    "masked fill of the sum": lambda b, c: (c.stream + b.out(c.mixed)).masked_fill(FIRST, 0.5),
+    "scatter_add": lambda b, c: c.stream.scatter_add(1, ORDER[None, :, None].expand_as(c.stream), b.out(c.mixed)),
+    "channels side by side": lambda b, c: c.stream + torch.cat([b.out(c.mixed), c.normed], -1).sum(-1, keepdim=True),
+    "one for all tokens": lambda b, c: c.stream + b.out(c.mixed).mean(1, keepdim=True),
     "lerp": lambda b, c: torch.lerp(c.stream, b.out(c.mixed), 0.4),
     "stack and sum": lambda b, c: torch.stack([c.stream, b.out(c.mixed)]).sum(0),
     "stack and mean": lambda b, c: torch.stack([b.out(c.mixed), c.normed, c.stream], dim=2).mean(dim=2),
@@ -402,6 +407,12 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-0.1, 0.1), "clamp"),
     "where it is positive": (lambda b, c: (lambda u: c.stream + torch.where(u > 0, u, 0 * u))(b.out(c.mixed)), ""),
     "lerp by a gate of it": (lambda b, c: (lambda u: torch.lerp(c.stream, u, u.sigmoid()))(b.out(c.mixed)), ""),
+    "stack weighted by itself": (
+        lambda b, c: (lambda both: (both * both.mean(-1, keepdim=True).softmax(0)).sum(0))(
+            torch.stack([c.stream, b.out(c.mixed)])
+        ),
+        "",
+    ),
     "stack and largest": (lambda b, c: torch.stack([c.stream, b.out(c.mixed)]).amax(0), ""),
     "projected inside of vmap": (lambda b, c: c.stream + torch.vmap(b.out)(c.mixed), "added to no tensor"),
     "squared": (lambda b, c: c.stream + b.out(c.mixed) ** 2, "pow"),
