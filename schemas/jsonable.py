@@ -36,11 +36,12 @@ def decode_json(content: bytes) -> Any:
         ValueError: it is no JSON.
     """
     try:
-        return msgspec.json.decode(content)
-    except msgspec.DecodeError:
-        if b"NaN" not in content and b"Infinity" not in content:
-            raise
-        return json.loads(content)  # slower
+        try:
+            return msgspec.json.decode(content)
+        except msgspec.DecodeError:
+            if b"NaN" not in content and b"Infinity" not in content:
+                raise
+            return json.loads(content)  # slower
     except RecursionError:
         raise ValueError("its lists and objects are nested too deep") from None
 

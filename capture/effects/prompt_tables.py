@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -17,9 +16,9 @@ from vla_attention.capture.effects.measurement import siblings_of
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.interventions.condition_name import plain
 from vla_attention.capture.interventions.prompts import with_synonyms
-from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import OtherPrompt
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.schemas.foreign_files import decode_toml, read_regular
 from vla_attention.schemas.groupings.words import folded_words, word_class
 from vla_attention.schemas.interventions import PromptKind
 from vla_attention.schemas.safe_text import check_text
@@ -138,15 +137,11 @@ def _tasks_of(given: str, instructions: Mapping[int, str]) -> list[int]:
 def _rows_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Where each row of a table stands, and its columns, with white space around them taken off."""
     try:
-        size = path.stat().st_size
-        text = path.read_text(encoding="utf-8-sig") if size <= _MOST_BYTES else ""
+        text = read_regular(path, _MOST_BYTES).decode("utf-8-sig")
         rows = list(_toml_rows(text) if path.suffix == ".toml" and text else _csv_rows(text))
-    except (OSError, ValueError, csv.Error, RecursionError) as error:
+    except (OSError, ValueError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise BadArgument(f"Cannot read the prompt table {path} ({reason}); expected CSV or TOML in UTF-8.") from None
-    if size > _MOST_BYTES:
-        most = format_bytes(_MOST_BYTES)
-        raise BadArgument(f"The prompt table {path} has {format_bytes(size)}; take at most {most} of its sentences.")
     if not rows:
         raise BadArgument(f"The prompt table {path} has no row; expected {listing(COLUMNS)} in each.")
     for where, row in rows:
@@ -162,7 +157,7 @@ def _csv_rows(text: str) -> Iterator[tuple[str, dict[Any, Any]]]:
 
 
 def _toml_rows(text: str) -> Iterator[tuple[str, dict[Any, Any]]]:
-    content = tomllib.loads(text)
+    content = decode_toml(text)
     rows = content.get("prompt")
     if set(content) != {"prompt"} or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ValueError("it is no list of [[prompt]]")

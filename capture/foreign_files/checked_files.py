@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.jsonable import decode_json
 
 #: What makes an error of a sentence: mostly a class of errors.
@@ -76,7 +77,7 @@ def read_object(path: Path, refuse: Refuse, *, inside: Path | None = None) -> di
     if (size := check_regular(path, refuse, inside=inside)) > MAX_JSON_BYTES:
         raise refuse(f"'{path}' has {size:,} bytes; expected at most {MAX_JSON_BYTES:,}.")
     try:
-        content = decode_json(path.read_bytes())
+        content = decode_json(read_regular(path, MAX_JSON_BYTES))
     except (ValueError, OSError) as error:
         raise refuse(f"'{path}' is not valid JSON ({error}).") from error
     if not isinstance(content, dict):

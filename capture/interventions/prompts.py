@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.foreign_files import read_regular, read_toml
 from vla_attention.schemas.groupings.words import folded_words, split_words
 from vla_attention.schemas.interventions import PromptChange
 from vla_attention.schemas.jsonable import decode_json
@@ -82,8 +82,7 @@ def check_synonyms(change: PromptChange, instructions: Iterable[str]) -> None:
 def read_synonyms(path: Path) -> dict[str, str]:
     """Read a JSON object or a TOML table of words and what replaces them; the ending of the name says which."""
     try:
-        given = path.read_bytes()
-        content = tomllib.loads(given.decode()) if path.suffix == ".toml" else decode_json(given)
+        content = read_toml(path) if path.suffix == ".toml" else decode_json(read_regular(path))
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise BadArgument(f"Cannot read the synonyms '{path}' ({reason}); expected JSON or TOML.") from None

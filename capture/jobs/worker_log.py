@@ -19,6 +19,7 @@ import msgspec
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.schemas.errors import Note, listing, plural, shortened
+from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.stores.worker import Worker
 
@@ -101,7 +102,7 @@ def read_logs(store: Path) -> list[Event]:
     unreadable: dict[str, str] = {}
     for file in sorted(folder.glob("*.jsonl")):
         try:
-            *lines, _ = file.read_bytes().split(b"\n")  # after the last line end there is nothing, or half a line
+            *lines, _ = read_regular(file).split(b"\n")  # after the last line end there is nothing, or half a line
         except OSError as error:
             unreadable[file.name] = f" ({error.strerror or error})"
             continue

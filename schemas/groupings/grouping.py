@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from vla_attention.schemas.errors import BadArgument, UserError, did_you_mean, listing, shortened
+from vla_attention.schemas.foreign_files import read_toml
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.jsonable import Document, MalformedDocument, from_json
@@ -123,7 +123,7 @@ class Grouping:
 def read_grouping_file(path: Path) -> Grouping:
     """Read a TOML grouping; every error names the file. The rest is a group of its own, unless one takes it."""
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = read_toml(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise GroupingNotFound(f"Cannot read grouping file {path}: {reason}.") from None

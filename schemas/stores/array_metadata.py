@@ -15,6 +15,8 @@ import numpy as np
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 _CODECS = ["bytes", "blosc", "crc32c"]
+#: Blosc's own limit.
+_MOST_CHUNK_BYTES = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,10 @@ def array_metadata(document: Any) -> ArrayMetadata:
         shard = codecs[0]["configuration"] if codecs[0]["name"] == "sharding_indexed" else None
         chunk = of_file if shard is None else shard["chunk_shape"]
         of_chunk = [codec["name"] for codec in (codecs if shard is None else shard["codecs"])]
+        dtype = np.dtype(str(document["data_type"])).newbyteorder("<")
+        are_extents = all(type(n) is int and n >= 0 for n in shape) and all(type(n) is int and n > 0 for n in chunk)
+        if not are_extents or dtype.kind not in "fiu" or math.prod(chunk) * dtype.itemsize > _MOST_CHUNK_BYTES:
+            raise ValueError(f"chunks of {chunk} numbers of the type {dtype} for the shape {shape}")
         # Extents of the shard in chunks; a remainder or several files make another layout.
         chunks = [divmod(extent, part) for extent, part in zip(of_file, chunk, strict=True)]
         one_file = all(extent <= most for extent, most in zip(shape, of_file, strict=True))
@@ -73,7 +79,7 @@ def array_metadata(document: Any) -> ArrayMetadata:
             raise ValueError(f"the codecs {of_chunk}, files of {of_file} and chunks of {chunk} for the shape {shape}")
         return ArrayMetadata(
             tuple(shape),
-            np.dtype(document["data_type"]).newbyteorder("<"),
+            dtype,
             tuple(chunk),
             None if shard is None else math.prod(count for count, _ in chunks),
             tuple(document["dimension_names"]),

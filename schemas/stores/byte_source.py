@@ -14,6 +14,8 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.foreign_files import MAX_DOCUMENT_BYTES, open_regular, read_regular
+
 #: Memory for bytes of a file, (byte,) uint8.
 Memory: TypeAlias = NDArray[np.uint8]
 
@@ -24,8 +26,8 @@ class ByteSource(Protocol):
     A source can be pickled.
     """
 
-    def whole(self, file: str) -> bytes:
-        """All bytes of a file."""
+    def whole(self, file: str, most: int = MAX_DOCUMENT_BYTES) -> bytes:
+        """All bytes of a file, which may have at most so many."""
 
     def part(self, file: str, offset: int, length: int) -> bytes:
         """So many bytes of a file from `offset` on; fewer where the file ends."""
@@ -43,20 +45,22 @@ class Folder:
 
     path: Path
 
-    def whole(self, file: str) -> bytes:
+    def whole(self, file: str, most: int = MAX_DOCUMENT_BYTES) -> bytes:
         """See `ByteSource`."""
-        with open(f"{self.path}/{file}", "rb", buffering=0) as opened:
-            return opened.readall()
+        return read_regular(f"{self.path}/{file}", most)
 
     def part(self, file: str, offset: int, length: int) -> bytes:
         """See `ByteSource`."""
-        with open(f"{self.path}/{file}", "rb", buffering=0) as opened:
-            return os.pread(opened.fileno(), length, offset)
+        handle = open_regular(f"{self.path}/{file}")
+        try:
+            return os.pread(handle, length, offset)
+        finally:
+            os.close(handle)
 
     def read_into(self, memory: Memory, file: str, offset: int) -> int:
         """See `ByteSource`."""
         # A scan reads thousands of chunks: Python's own file objects take longer than the read.
-        handle = os.open(f"{self.path}/{file}", os.O_RDONLY | os.O_CLOEXEC)
+        handle = open_regular(f"{self.path}/{file}")
         try:
             return os.preadv(handle, [memory.data], offset)
         finally:

@@ -34,6 +34,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
+from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.jsonable import MalformedDocument, decode_json, from_json, to_json
 from vla_attention.schemas.stores.store_format import StoreExists, StoreNotFound, is_episode_name
 from vla_attention.schemas.stores.worker import Worker, is_known_dead, this_worker
@@ -52,6 +53,8 @@ DEAD_AFTER_S = 300.0
 WRITTEN_WITHIN_S = 10.0
 _LOCK, _TAKING, _ASIDE = ".lock", ".taking", "removed-"
 _ATTEMPTS = 5
+#: Of a lock: a worker in JSON.
+_MOST_BYTES = 10_000
 _UNKNOWN = Worker("", "an unknown machine", 0, "", "")
 
 
@@ -350,7 +353,7 @@ def store_locks(store: Path, worker: Worker | None = None) -> Locks:
 
 def _look(file: Path) -> _Seen | None:
     try:
-        content = file.read_bytes()
+        content = read_regular(file, _MOST_BYTES)
     except FileNotFoundError:
         return None
     except OSError:

@@ -164,6 +164,12 @@ class StoredEpisode:
                 raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
             document = self.document(f"{name}/zarr.json")
             metadata = self._readable(name, lambda: array_metadata(document))
+            if metadata.shape != (stated := self.attributes.arrays[name].shape):
+                raise CorruptEpisode(
+                    f"Array {name} of episode {self.name} cannot be read: its zarr.json says the shape "
+                    f"{metadata.shape}, and the episode's attributes {stated}.",
+                    f"{name}/zarr.json",
+                )
             self._arrays[name] = StoredArray(name, metadata, self.files)
         return self._arrays[name]
 
@@ -197,7 +203,10 @@ class StoredEpisode:
     def _numbers_as_array(self, name: str) -> Any:
         """The numbers of that name in the attributes, None without any."""
         numbers = self._numbers_of(name)
-        return np.array(numbers, dtype=NUMBERS[name]) if numbers else None
+        try:
+            return np.array(numbers, dtype=NUMBERS[name]) if numbers else None
+        except OverflowError as error:
+            raise CorruptEpisode(f"Episode {self.name} cannot be read: its {name} are damaged ({error}).") from None
 
     def shape_of(self, name: str) -> tuple[int, ...]:
         """Shape of one array; raises `CorruptEpisode` for one that its files cannot have."""
@@ -224,6 +233,8 @@ class StoredEpisode:
             return read()
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.", error.file) from None
+        except MemoryError:
+            raise CorruptEpisode(f"Array {name} of episode {self.name} is said to be larger than the memory.") from None
 
     def refuse_missing(self, name: str, values: NDArray[Any]) -> None:
         """Raise `CorruptEpisode` when values of an array, or sums of them, have the mark of a lost chunk."""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.foreign_files import MAX_DOCUMENT_BYTES
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress, StorePlace, StoreUrl, stated_commit
 
@@ -104,7 +105,7 @@ class RemoteFolder:
 
     url: str
 
-    def whole(self, file: str) -> bytes:
+    def whole(self, file: str, most: int = MAX_DOCUMENT_BYTES) -> bytes:
         """See `ByteSource`."""
         content: bytes = _asked(self.url, "cat_file", self._path(file))
         return content

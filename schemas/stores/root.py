@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.jsonable import MalformedDocument, decode_json, from_json
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, is_web, source_of
@@ -88,7 +89,7 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
         return
     for above in path.absolute().parents:
         try:
-            stated = group_attributes((above / "zarr.json").read_bytes())
+            stated = group_attributes(read_regular(above / "zarr.json"))
         except (OSError, ValueError):
             return  # the store's groups are all above one another
         if stated.get("format") == FORMAT_NAME:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vla_attention.schemas.foreign_files import MAX_DOCUMENT_BYTES
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
@@ -50,21 +51,24 @@ class SealedFiles:
         """
         record = self.record(file)
         with _reading(file):
-            content = self.source.whole(file)
+            content = self.source.whole(file, record.size)
         if len(content) != record.size or bytes_digest(content) != record.sha256:
             raise CorruptEpisode(_differs(file), file)
         return content
 
     def parts(self, file: str) -> Iterator[bytes]:
         """The bytes of a file part by part; its end raises as `whole` does unless they are those of the seal."""
-        record, digest = self.record(file), hashlib.sha256()
+        record, digest, read = self.record(file), hashlib.sha256(), 0
         with _reading(file):
             # One byte more at the end: a file that has grown is not the one that was sealed.
             for offset in range(0, record.size + 1, PART_BYTES):
                 part = self.source.part(file, offset, min(PART_BYTES, record.size + 1 - offset))
+                if not part:
+                    break
                 digest.update(part)
+                read += len(part)
                 yield part
-        if digest.hexdigest() != record.sha256:
+        if digest.hexdigest() != record.sha256 or read != record.size:
             raise CorruptEpisode(_differs(file), file)
 
     def check(self, file: str) -> None:
@@ -87,6 +91,8 @@ class SealedFiles:
             CorruptEpisode: its index is not the one in the seal, or the file cannot be read.
         """
         record, size = self.record(file), index_size(chunks)
+        if size > min(record.size, MAX_DOCUMENT_BYTES):
+            raise CorruptEpisode(f"its {file} has {record.size} bytes, too few for {chunks} chunks", file)
         with _reading(file):
             # One byte more: a file that has grown is not the one that was sealed.
             stored = self.source.part(file, max(0, record.size - size), size + 1)
@@ -142,8 +148,8 @@ class SealedShard:
         offset, length = self.places[number]
         if length < 0:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing", self.file)
-        stored = np.empty(length, np.uint8) if memory is None else memory[:length]
         with _reading(self.file):
+            stored = np.empty(length, np.uint8) if memory is None else memory[:length]
             count = self.source.read_into(stored, self.file, offset)
         if count != length:
             raise CorruptEpisode(f"its {self.file} ends in chunk {number}", self.file)
@@ -162,6 +168,8 @@ def _reading(file: str) -> Iterator[None]:
         raise
     except OSError as error:
         raise CorruptEpisode(_lost(file, error), file) from None
+    except MemoryError:
+        raise CorruptEpisode(f"its {file} is said to have more bytes than there is memory", file) from None
 
 
 def _differs(file: str) -> str:

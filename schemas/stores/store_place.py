@@ -11,6 +11,7 @@ from pathlib import Path
 
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_SUFFIX
 
@@ -49,7 +50,7 @@ def _refuse_in(folders: Iterable[Path], path: Path, doing: str) -> None:
 
 def _is_store(folder: Path) -> bool:
     try:
-        return group_attributes((folder / "zarr.json").read_bytes()).get("format") == FORMAT_NAME
+        return group_attributes(read_regular(folder / "zarr.json")).get("format") == FORMAT_NAME
     except (OSError, ValueError):
         return False
 

@@ -101,6 +101,10 @@ class StoredArray:
             frame, what = memoryview(self.files.whole(self._file))[:-CHECKSUM_BYTES], "it"
         else:
             frame, what = self._shard.chunk(number, stored).data, f"chunk {number} of it"
+        # Blosc leaves what a shorter chunk does not fill as it was. Its header has the decoded size.
+        size = int.from_bytes(frame[4:8], "little")
+        if size != values.nbytes:
+            raise CorruptEpisode(f"{what} decodes to {size} bytes; expected {values.nbytes}", self._file)
         try:
             blosc.decompress(frame, values)
         except (RuntimeError, ValueError) as error:

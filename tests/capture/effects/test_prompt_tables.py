@@ -47,7 +47,7 @@ kind = "paraphrased"
         ("a.csv", "task,sentence,kind\n0,,paraphrased\n", "line 2: .*'paraphrased'"),
         ("a.csv", "task,sentence,kind\n0,Go!,paraphrased\n0,go,contradicted\n", "line 3: Task 0 .*line 2"),
         ("a.csv", "task,sentence,kind\n0,Lift the red cube.,shuffled\n", "line 2: Task 0 "),
-        ("a.csv", "task,sentence,kind\n" + "0,go,empty\n" * 100_000, "1.1 MB; .* 1 MB"),
+        ("a.csv", "task,sentence,kind\n" + "0,go,empty\n" * 100_000, "1,100,019 bytes; .* 1,000,000"),
         ("a.csv", b"\xff\xfe", "a.csv"),
         ("a.toml", "task = 1", r"\[\[prompt\]\]"),
         ("a.toml", f"{TOML}more = 1", "prompt 1: .*more"),
