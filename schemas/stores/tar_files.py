@@ -6,6 +6,8 @@ import tarfile
 from collections.abc import Collection
 from pathlib import Path
 
+from vla_attention.schemas.foreign_files import open_regular
+
 
 def write_tar(folder: Path, path: Path) -> None:
     """Write a folder into a tar file, under its own name; compressed where the file's name ends with `.xz`.
@@ -26,7 +28,9 @@ def write_tar(folder: Path, path: Path) -> None:
 
 
 def unpack(path: Path, into: Path, only: Collection[str] = ()) -> None:
-    """Unpack a tar file into a folder; nothing is written outside of it.
+    """Unpack a tar file into a folder; nothing is written outside of it, and no more than the file's own bytes.
+
+    Only one whose name ends with `.xz` may be compressed.
 
     only: names of files in the tar; all without.
 
@@ -34,5 +38,12 @@ def unpack(path: Path, into: Path, only: Collection[str] = ()) -> None:
         tarfile.TarError: it is no tar file, is damaged, or would write elsewhere.
         KeyError: it lacks one of the files.
     """
-    with tarfile.open(path) as tar:
+    is_compressed = path.suffix == ".xz"
+    try:
+        handle = open_regular(path)
+    except OSError as error:
+        raise tarfile.ReadError(error.strerror or str(error)) from None
+    with open(handle, "rb") as file, tarfile.open(fileobj=file, mode="r:xz" if is_compressed else "r:") as tar:
+        if not is_compressed and sum(member.size for member in tar) > path.stat().st_size:
+            raise tarfile.ReadError("its files are larger than itself")
         tar.extractall(into, members=[tar.getmember(name) for name in only] or None, filter="data")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
+import lzma
+import os
 import re
 import shutil
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -175,6 +179,32 @@ def test_command_line(original, tmp_path, capsys):
         assert expected in said
         assert said.count("\n") == 1
     assert not (tmp_path / "x.zarr").exists()
+
+
+@pytest.mark.parametrize("kind", ["compressed", "pipe", "folder", "holes", "text"])
+def test_what_is_no_tar_file_of_an_episode_is_damage_and_takes_no_room(original, tmp_path, kind):
+    tars = tmp_path / "tars.zarr"
+    copy_store(open_store(original), tars, (), tar=True)
+    tar = tars / "episodes/task000_episode000.tar"
+    whole = tar.read_bytes()
+    tar.unlink()
+    match kind:
+        case "compressed":
+            tar.write_bytes(lzma.compress(whole))
+        case "pipe":
+            os.mkfifo(tar)
+        case "folder":
+            tar.mkdir()
+        case "text":
+            tar.write_text("text")
+        case "holes":
+            headers = {"GNU.sparse.major": "1", "GNU.sparse.minor": "0", "GNU.sparse.realsize": str(10**15)}
+            hole = tarfile.TarInfo("task000_episode000/hole")
+            hole.pax_headers, hole.size = headers, 512
+            with tarfile.open(tar, "w", format=tarfile.PAX_FORMAT) as file:
+                file.addfile(hole, io.BytesIO(b"1\n0\n1\n".ljust(512, b"\0")))
+    with pytest.raises(CorruptEpisode, match="task000_episode000"):
+        copy_store(open_source(tars), tmp_path / "back.zarr", ())
 
 
 def test_tar_files_are_the_store_again_and_a_copy_of_them_goes_on(original, tmp_path, capsys):
