@@ -25,7 +25,7 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.outcomes import LaterOutcome, read_outcomes
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
-from vla_attention.schemas.stores.root import attributes_in, list_episodes, read_run
+from vla_attention.schemas.stores.root import NAMES_FILE, attributes_in, list_episodes, read_run, unlisted_episodes
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
@@ -340,16 +340,23 @@ def open_store(path: str | StorePlace) -> Store:
     path = at_commit(store_place(path))
     root, run = read_run(path)
     folders, strays = list_episodes(path)
-    stray = (
-        f"Ignored in {path}, among its episodes: {visible(listing(strays))}; they are no episodes. Move them out of "
-        "the store."
-    )
+    notes = []
     if strays:
-        warnings.warn(stray, Note, stacklevel=2)
+        notes.append(
+            f"Ignored in {path}, among its episodes: {visible(listing(strays))}; they are no episodes. Move them out "
+            "of the store."
+        )
+    if unlisted := unlisted_episodes(path, {folder.name for folder in folders}):
+        notes.append(
+            f"Ignored in {path}: {listing(unlisted, 4)}, which its {NAMES_FILE} does not list. If they belong to it, "
+            "upload a new copy, whose list has them."
+        )
+    for note in notes:
+        warnings.warn(note, Note, stacklevel=2)
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
     told = read_outcomes(path)
     episodes = tuple(StoredEpisode(folder, folder.name, run, told.get(folder.name)) for folder in folders)
-    return Store(path, root, run, episodes, (stray,) if strays else ())
+    return Store(path, root, run, episodes, tuple(notes))
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import os
 import re
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -29,6 +31,8 @@ _WITH_PASSWORDS = ("http", "https", "ftp", "sftp", "ssh", "smb", "webdav")
 #: Seconds without a connection, or without a further byte, after which a server counts as silent. aiohttp's own limit
 #: is five minutes for a whole answer: too long for a server that hangs, and too short for a large file.
 ANSWER_WITHIN_S = 60.0
+#: Bytes a second that an answer must have beyond that time, and bytes that are taken at once.
+_SLOWEST, _READ_BYTES = 10_000, 1 << 18
 #: Compressed answers to a range are ranges of compressed files.
 _AS_IT_IS = {"Accept-Encoding": "identity"}
 
@@ -80,7 +84,8 @@ def at_commit(place: StorePlace) -> StorePlace:
         return place
     asked = address.revision_address(_hub()[0])
     try:
-        answer = _asked(place.url, "cat_file", asked)
+        files = _file_system(place.url)[0]
+        answer = _asked(place.url, lambda: _of_web_server(files, asked, None, MAX_DOCUMENT_BYTES))
     except FileNotFoundError:
         raise RemoteFailure(
             f"{place.url} cannot be read: the hub knows no revision {address.revision} of {address.repository}. "
@@ -107,12 +112,14 @@ class RemoteFolder:
 
     def whole(self, file: str, most: int = MAX_DOCUMENT_BYTES) -> bytes:
         """See `ByteSource`."""
-        content: bytes = _asked(self.url, "cat_file", self._path(file))
+        content = self._bytes(file, None, most)
+        if len(content) > most:
+            raise RemoteFailure(f"{self.url} cannot be read: its {file} has more than {most:,} bytes.")
         return content
 
     def part(self, file: str, offset: int, length: int) -> bytes:
         """See `ByteSource`; one request."""
-        content: bytes = _asked(self.url, "cat_file", self._path(file), start=offset, end=offset + length)
+        content = self._bytes(file, offset, length)
         if len(content) > length:
             raise RemoteFailure(
                 f"The server of {self.url} sends whole files where a part was asked for (no range requests), so that "
@@ -135,6 +142,23 @@ class RemoteFolder:
         files, path = _hub_listing(self.url) if self.url.startswith(HUB_PROTOCOL) else _file_system(self.url)
         names = _asked(self.url, "ls", f"{path}/{folder}", files=files, detail=False)
         return sorted(str(name).rstrip("/").rpartition("/")[2] for name in names)
+
+    def _bytes(self, file: str, first: int | None, most: int) -> bytes:
+        """So many bytes of a file from one on; None: all of it. A web server's longer answer has one byte more."""
+        files, path = _file_system(self.url)
+        address = f"{path}/{file}"
+        if hasattr(files, "set_session"):
+            content: bytes = _asked(self.url, lambda: _of_web_server(files, address, first, most))
+        else:
+            part = {} if first is None else {"start": first, "end": first + most}
+            content = _asked(self.url, "cat_file", address, **part)
+        return content
+
+    def shown(self, folder: str) -> str:
+        """The page on which a web server shows a folder; `OSError` where it shows none."""
+        files, path = _file_system(self.url)
+        page: bytes = _asked(self.url, lambda: _of_web_server(files, f"{path}/{folder}/", None, MAX_DOCUMENT_BYTES))
+        return page.decode(errors="replace")
 
     def _path(self, file: str) -> str:
         return f"{_file_system(self.url)[1]}/{file}"
@@ -204,13 +228,36 @@ def _missing(url: str, error: ImportError) -> RemoteFailure:
     )
 
 
-def _asked(url: str, method: str, *given: Any, files: Any = None, **named: Any) -> Any:
-    """What a method of a file system answers; what it raises becomes an `OSError` with the address.
+def _of_web_server(files: Any, address: str, first: int | None, most: int) -> bytes:
+    """What a server sends for a file or a part of it, as it is stored; of a longer answer one byte more than `most`."""
+    from fsspec.asyn import sync
+
+    async def fetched() -> bytes:
+        given = dict(files.kwargs)
+        if first is not None:
+            given["headers"] = {**given.get("headers", {}), "Range": f"bytes={first}-{first + most - 1}"}
+        content, began = bytearray(), time.monotonic()
+        async with (await files.set_session()).get(files.encode_url(address), **given) as answer:
+            files._raise_not_found_for_status(answer, address)
+            if answer.headers.get("Content-Encoding", "identity") != "identity":
+                raise OSError("its server compresses files, which was not asked for")
+            while len(content) <= most and (part := await answer.content.read(_READ_BYTES)):
+                content += part[: most + 1 - len(content)]
+                if time.monotonic() - began > ANSWER_WITHIN_S + len(content) / _SLOWEST:
+                    raise OSError(f"its server sent {len(content):,} bytes in {time.monotonic() - began:.0f} s")
+        return bytes(content)
+
+    found: bytes = sync(files.loop, fetched) if most or first is None else b""
+    return found
+
+
+def _asked(url: str, method: str | Callable[[], Any], *given: Any, files: Any = None, **named: Any) -> Any:
+    """What a method of a file system, or a function, answers; what it raises becomes an `OSError` with the address.
 
     files: the file system, if it is not that of the address.
     """
     try:
-        return getattr(files or _file_system(url)[0], method)(*given, **named)
+        return method() if callable(method) else getattr(files or _file_system(url)[0], method)(*given, **named)
     except (FileNotFoundError, NotImplementedError, UserError):
         raise
     except TimeoutError:

@@ -6,7 +6,9 @@ A copy has one more file, `NAMES_FILE`: web servers list nothing. Where a folder
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +131,16 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
         )
     strays = sorted(name for name, is_episode in is_episode_of.items() if not is_episode and name != "zarr.json")
     return [path / EPISODES_GROUP / name for name, is_episode in is_episode_of.items() if is_episode], strays
+
+
+def unlisted_episodes(path: StorePlace, listed: Collection[str]) -> list[str]:
+    """Episodes that a web server shows and a copy's `NAMES_FILE` does not list; none where it shows no folders."""
+    if not isinstance(path, StoreUrl) or not is_web(path):
+        return []
+    with suppress(OSError):
+        shown = re.findall(r"\w+", RemoteFolder(path.url).shown(EPISODES_GROUP))
+        return sorted({name for name in shown if is_episode_name(name)} - set(listed))
+    return []
 
 
 def names_document(names: Sequence[str]) -> bytes:

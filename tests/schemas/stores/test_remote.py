@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
 import threading
-from collections.abc import Iterator
-from contextlib import suppress
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +22,10 @@ from tests.kit.http_ranges import Served, serve
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.store.copying import copy_store
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import Note, UserError
 from vla_attention.schemas.stores import remote_source
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.remote_source import RemoteFolder
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.store_url import StoreUrl, store_place
 from vla_attention.schemas.stores.verify import verify_store
@@ -149,6 +154,81 @@ def test_a_server_that_does_not_answer_is_a_sentence(server, monkeypatch):
             open_store(f"{server.url}/a.zarr")
     finally:
         ends.set()
+
+
+@contextmanager
+def answering(answer: Callable[[BaseHTTPRequestHandler], None]) -> Iterator[str]:
+    """The address of a server that answers everything in one way."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            with suppress(OSError):
+                answer(self)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}/a.zarr"
+        finally:
+            server.shutdown()
+
+
+def endless(handler: BaseHTTPRequestHandler) -> None:
+    handler.end_headers()
+    while True:
+        handler.wfile.write(b" " * 1_000_000)
+
+
+def compressed(handler: BaseHTTPRequestHandler) -> None:
+    content = gzip.compress(bytes(300_000_000), 1)
+    handler.send_header("Content-Encoding", "gzip")
+    handler.send_header("Content-Length", str(len(content)))
+    handler.end_headers()
+    handler.wfile.write(content)
+
+
+def dripping(handler: BaseHTTPRequestHandler) -> None:
+    handler.end_headers()
+    while True:
+        handler.wfile.write(b" ")
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("answer", [endless, compressed, dripping], ids=lambda answer: answer.__name__)
+def test_an_answer_without_end_ends_with_a_sentence(monkeypatch, answer):
+    monkeypatch.setattr(remote_source, "ANSWER_WITHIN_S", 0.3 if answer is dripping else 60)
+    with answering(answer) as url:
+        with pytest.raises(UserError) as caught:
+            open_store(url)
+        with pytest.raises(OSError, match=url):
+            RemoteFolder(url).part("a", 0, 10)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_list_that_lacks_episodes_is_named_where_the_server_shows_them(copied, tmp_path):
+    store = Path(shutil.copytree(copied, tmp_path / "a.zarr"))
+    (store / "episodes.json").write_text('["task000_episode001"]')
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path))) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            with pytest.warns(Note, match="task000_episode000"):
+                opened = open_store(f"http://127.0.0.1:{server.server_address[1]}/a.zarr")
+            shutil.copy(copied / "episodes.json", store / "episodes.json")
+            assert open_store(str(opened.path)).notes == ()
+        finally:
+            server.shutdown()
+    assert [episode.name for episode in opened.episodes] == ["task000_episode001"]
+    assert len(opened.notes) == 1
 
 
 def test_a_server_without_ranges_is_refused_with_a_sentence(server, copied, capsys):
