@@ -27,6 +27,7 @@ from msgspec.structs import fields
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.schemas.errors import listing, shortened
+from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.jsonable import decode_json
 from vla_attention.schemas.results import (
     RESULTS_PREFIX,
@@ -42,6 +43,8 @@ from vla_attention.schemas.safe_text import visible
 _LAYER = re.compile(r"layer_([0-9]{1,6})")
 #: Whole numbers are at most this: tasks, episodes and steps are counted.
 _MOST_COUNTED = 10**12
+#: Bytes of a results file; a thousand episodes of the published scripts take 100 MB.
+_MOST_BYTES = 2_000_000_000
 #: The published scripts treat a mass of up to this as zero, and write a ratio of 0 where both masses are zero.
 NO_MASS = 1e-8
 RATIO = "visual_linguistic_ratio"
@@ -168,7 +171,7 @@ def read_results_file(path: Path) -> ResultsFile:
         ResultsError: it is no results file, or a field is wrong; names the file, the episode and the field.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular(path, _MOST_BYTES)
     except OSError as error:
         raise ResultsNotFound(f"Cannot read results file {path}: {error.strerror or error}.") from None
     try:

@@ -22,6 +22,7 @@ from typing import Any
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.durable_files import publish, publish_file
+from vla_attention.schemas.stores.episode_files import foreign_in_episode
 from vla_attention.schemas.stores.locks import WHOLE_STORE, store_locks
 from vla_attention.schemas.stores.outcomes import read_outcomes, write_outcomes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
@@ -100,7 +101,11 @@ def _unpacked(episode: StoredEpisode, building: Path, only: str = "") -> StoredE
         unpack(tar, into, [f"{episode.name}/{only}"] if only else ())
     except (tarfile.TarError, KeyError, EOFError) as error:
         raise CorruptEpisode(f"Episode {episode.name} cannot be read: its tar file is damaged ({error}).") from None
-    return replace(episode, folder=into / episode.name)
+    found = replace(episode, folder=into / episode.name)
+    if not only and (foreign := foreign_in_episode(found)):
+        more = f"its tar file holds more than its seal lists: {listing(foreign, 3)}"
+        raise CorruptEpisode(f"Episode {episode.name} cannot be read: {more}.")
+    return found
 
 
 def part_sizes(store: Store) -> dict[str, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -294,3 +295,9 @@ def test_any_masses_give_the_numbers_of_numpy(data):
             assert ratio == pytest.approx(finite.mean())
     # What differs from the file's summaries always has a known reason.
     assert disagreements(file).filter(reason="").is_empty()
+
+
+def test_a_pipe_in_place_of_a_results_file_ends_at_once(tmp_path):
+    os.mkfifo(tmp_path / "attention_ratio_results_goal.json")
+    with pytest.raises(ResultsNotFound, match="attention_ratio_results_goal"):
+        read_results_file(tmp_path / "attention_ratio_results_goal.json")

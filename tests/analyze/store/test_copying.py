@@ -181,7 +181,7 @@ def test_command_line(original, tmp_path, capsys):
     assert not (tmp_path / "x.zarr").exists()
 
 
-@pytest.mark.parametrize("kind", ["compressed", "pipe", "folder", "holes", "text"])
+@pytest.mark.parametrize("kind", ["compressed", "pipe", "folder", "holes", "text", "more"])
 def test_what_is_no_tar_file_of_an_episode_is_damage_and_takes_no_room(original, tmp_path, kind):
     tars = tmp_path / "tars.zarr"
     copy_store(open_store(original), tars, (), tar=True)
@@ -197,6 +197,10 @@ def test_what_is_no_tar_file_of_an_episode_is_damage_and_takes_no_room(original,
             tar.mkdir()
         case "text":
             tar.write_text("text")
+        case "more":  # a file that the seal does not list
+            tar.write_bytes(whole)
+            with tarfile.open(tar, "a") as file:
+                file.addfile(tarfile.TarInfo("task000_episode000/joint/notes"))
         case "holes":
             headers = {"GNU.sparse.major": "1", "GNU.sparse.minor": "0", "GNU.sparse.realsize": str(10**15)}
             hole = tarfile.TarInfo("task000_episode000/hole")
