@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _analyses(given)
     print(
         f"vla-attention: There is no command '{name}'.{did_you_mean(name, known)} "
-        f"Commands: {listing(known, 40)}. See vla-attention --help.",
+        f"Commands: {listing(dict.fromkeys(known), 40)}. See vla-attention --help.",
         file=sys.stderr,
     )
     return 2

@@ -85,9 +85,14 @@ def _outcome(run: Run, first: Run) -> str:
     if run is not first and run.repeats(first):
         calls = f"the policy calls of {plural(len(run.question.selected), 'episode')} of {first.name} again"
         return f"{calls}, with {run.changed}; outcome not run"
-    outcomes = [item.episode.attributes.success for item in run.question.selected]
     policy = run.stores[0].attributes.policy.name
+    outcomes = [item.episode.attributes.success for item in run.question.selected]
     return f"{policy} on {listing(run.suites)}, {solved(outcomes, run.question.num_tasks)}"
+
+
+def _outcomes(run: Run) -> list[bool]:
+    """Of each episode whether its outcome is known."""
+    return [item.episode.attributes.success is not None for item in run.question.selected]
 
 
 def _how_alike(part: Compared) -> list[str]:
@@ -97,8 +102,8 @@ def _how_alike(part: Compared) -> list[str]:
     said = []
     if len(apart):
         said.append(
-            f"Not paired: {plural(len(apart), 'episode')} of {runs} with one task and number: their first pictures "
-            f"differ (on average by {min(apart):.0f} of 255 or more)."
+            f"Not paired: {plural(len(apart), 'episode')} of {runs} with the same task and number, since they begin "
+            f"with other pictures (a pixel differs by {min(apart):.0f} of 255 or more on average)."
         )
     if by_number:
         said.append(
@@ -107,8 +112,8 @@ def _how_alike(part: Compared) -> list[str]:
         )
     if rest := seen.height - by_number:
         said.append(
-            f"{plural(rest, 'pair')} of {runs} by task and number: their first pictures are alike, their initial "
-            "states are not known."
+            f"Paired by number, since the initial states of {runs} are not all known: in {plural(rest, 'pair')} the "
+            "first pictures hardly differ (a pixel by at most 2 of 255 on average). Small objects may stand elsewhere."
         )
     return said
 
@@ -116,14 +121,20 @@ def _how_alike(part: Compared) -> list[str]:
 def _pairing(part: Compared, any_seed: bool) -> str:
     """How episodes were paired, and which have no partner."""
     first, other = part.first.run, part.other.run
-    what = "the same policy calls" if other.repeats(first) else "the same task, initial state and seed"
-    what = "the same task and initial state; seeds may differ" if any_seed else what
+    stated = [bool(one.episodes["stated"].all()) for one in (part.first, part.other)]
+    start = "initial state" if all(stated) else "number" if not any(stated) else "start"
+    what = f"the same task and {start}" if any_seed else f"the same task, {start} and seed"
+    what = "the same policy calls" if other.repeats(first) else what
     if part.pairs.is_empty():
+        why = "" if any_seed else " Where seeds alone differ, --allow-mismatch seed pairs them."
+        if any(stated) and not all(stated):
+            why = f" Only {(first, other)[stated[1]].name} says in which states its episodes begin."
         return (
-            f"NOT PAIRED: no episode of {other.name} has {what} as one of {first.name}, so means of independent "
-            "episodes are compared; differences between scenes are in them."
+            f"NOT PAIRED: no episodes of {other.name} and {first.name} have {what}, so means of independent episodes "
+            f"are compared; differences between scenes are in them.{why}"
         )
-    text = f"{plural(part.pairs.height, 'pair')} of episodes of {other.name} and {first.name} with {what}."
+    text = f"{plural(part.pairs.height, 'pair')} of episodes of {other.name} and {first.name} with {what}"
+    text += f"{'' if part.pairs['seed'].null_count() == 0 else ' (seeds are not all known)'}."
     for (run,), rows in part.alone().group_by("run", maintain_order=True):
         named = [f"task {task} episode {episode}" for _, task, episode in rows.select(EPISODE_ID).iter_rows()]
         text += f" {plural(rows.height, 'episode')} of {run} without a partner: {listing(named, 4)}."
@@ -137,7 +148,8 @@ def _how_far(first: Run, reruns: Sequence[Run], sampling: Sampling) -> tuple[lis
     episodes, units = moved_episodes(first, reruns)
     table, findings = moved(episodes, units, sampling), []
     for run, row in zip(reruns, table.iter_rows(named=True), strict=True):
-        said = f"{run.name}: {units.said(with_interval(row, 'effect'))} than in {first.name}"
+        beside = "than in" if units.centimetres is not None else "against"
+        said = f"{run.name}: {units.said(with_interval(row, 'effect'))} {beside} {first.name}"
         limit, times = "", row["over_noise"]
         if is_noise(run):
             said += ", by another noise seed alone"
@@ -183,17 +195,19 @@ def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame)
 def _success(part: Compared) -> Finding:
     """Won and lost with the exact test, and what the pairs could have shown; without pairs, both shares."""
     first, name = part.first.run.name, part.name
+    unknown = [run.name for run in (part.first.run, part.other.run) if not any(_outcomes(run))]
+    if unknown:
+        later = "vla-attention store outcomes STORE FILE.csv tells outcomes that a scorer or a person gives later."
+        return Finding(f"No outcome is known of {listing(unknown)}.", _BETTER, limit=later)
     if part.pairs.is_empty():
         row = part.rows["groups"].filter(ALL, quantity="success").head(1).to_dicts()
-        if not row:
-            return Finding("Of one of the runs no outcome is known.", _BETTER)
         shares = f"{name} solves {row[0]['mean_other']:.0%} of {row[0]['num_other']} episodes, {first} "
         shares += f"{row[0]['mean_first']:.0%} of {row[0]['num_first']}"
         shown = (row[0]["difference_q"] or 1.0) <= NAMED_AT
         return Finding(f"{'' if shown else 'Not shown to differ: '}{shares}.", _BETTER, row[0])
     pairs = part.values["groups"].filter(pl.col("difference").is_not_null(), quantity="success").unique(PAIR)
     if pairs.is_empty():
-        return Finding("Of one of the runs no outcome is known.", _BETTER)
+        return Finding("There is no pair of episodes of which both outcomes are known.", _BETTER)
     lost, won = int((pairs["difference"] < 0).sum()), int((pairs["difference"] > 0).sum())
     n, p, fewest = pairs.height, mcnemar(won, lost), next(k for k in range(1, 99) if mcnemar(0, k) <= NAMED_AT)
     verdict = "Not shown to differ" if p > NAMED_AT else f"{name} does {'better' if won > lost else 'worse'}"
@@ -201,6 +215,8 @@ def _success(part: Compared) -> Finding:
     said += f"; {lost} lost, {won} won (exact p = {p:.2g})."
     limit = "" if p <= NAMED_AT else f"To show a difference, {fewest} pairs or more must change, all in one direction; "
     limit += f"here {won + lost} of {n} changed." if limit else ""
+    left = part.pairs.height - n
+    limit = f"Not counted: {plural(left, 'pair')} without a known outcome. {limit}".strip() if left else limit
     return Finding(said, _BETTER, {"won": won, "lost": lost, "n": n, "p": p}, limit)
 
 

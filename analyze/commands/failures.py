@@ -23,7 +23,10 @@ _OUTCOME = ("suite", "task_id", "instruction", "solved", "num_steps")
 #: Columns that only `behaviour` and joins need.
 _KEYS = ("goals", "scene", "state", "as_told", "told_goal", "own_goal", "scene_goal", "twin_index", "twin_replan")
 _WHY = "Why did it fail?"
-_UNKNOWN = "An episode is solved or failed where a simulator or the recording code says so; a replay runs nothing."
+_UNKNOWN = (
+    "An episode is solved or failed where a simulator or the recording code says so, or vla-attention store outcomes "
+    "tells it later; a replay runs nothing."
+)
 _WHERE = "Where did it leave the solved ones?"
 _BEFORE = "What tells beforehand?"
 _FEW = 10  # failures; fewer are described, one by one
@@ -56,7 +59,8 @@ def failures(question: Question, twins: Question | None = None) -> Result:
     if twins is not None and failed and not left:
         raise BadArgument(
             f"None of the {len(failed)} failed episodes has a twin in {listing(s.path for s in twins.stores)}: no "
-            "solved episode there has the same task and initial state; give one of the same suite, tasks and seed."
+            "solved episode there has the same task and initial state, as far as these are known; give one of the same "
+            "suite, tasks and seed."
         )
     places = beside(question, twins or question, left)
     rows = lost.join(places, on=EPISODE_ID, how="left", maintain_order="left").drop(_KEYS)

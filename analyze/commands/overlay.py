@@ -188,7 +188,7 @@ _TYPES: dict[str, Any] = {
 
 def _place(row: int, column: int, shape: tuple[int, ...]) -> str:
     vertical, horizontal = (
-        part[min(2, 3 * at // side)] for part, at, side in zip(_PLACES, (row, column), shape, strict=True)
+        part[int(3 * (at + 0.5) / side)] for part, at, side in zip(_PLACES, (row, column), shape, strict=True)
     )
     return f"{vertical} {horizontal}"
 

@@ -23,7 +23,7 @@ from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.safe_text import visible
 
-_VALUES: dict[str, Scale] = {"keys": "positive", "mass": "positive", "lift": "positive", "share": "share"}
+_VALUES: dict[str, Scale] = {"keys": "positive", "mass": "share", "lift": "positive", "share": "share"}
 #: Of the words that are read more than uniform attention would, so many are named.
 _MOST_NAMED = 5
 LIFT = "attention to the word, over what it would get if attention were spread evenly over all tokens"

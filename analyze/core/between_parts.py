@@ -52,6 +52,9 @@ def _values(levels: Levels, by: Collection[str]) -> _Values:
     return _Values(pl.concat([ratios, groups]), name)
 
 
+_MORE = "Record more episodes of each task. Outcomes that were not known are told with vla-attention store outcomes."
+
+
 def of_outcome(levels: Levels) -> tuple[Finding, list[Table]]:
     """Solved against failed episodes, within the tasks that have both."""
     values = _values(levels, ())
@@ -60,7 +63,12 @@ def of_outcome(levels: Levels) -> tuple[Finding, list[Table]]:
     tasks = both.select("suite", "task_id").n_unique()
     if both.is_empty():
         said = "No task has both solved and failed episodes: whether they differ cannot be told from how tasks differ."
-        return Finding(said, _OUTCOME, {"tasks_with_both": 0}, "Record more episodes of each task."), []
+        return Finding(
+            said,
+            _OUTCOME,
+            {"tasks_with_both": 0},
+            _MORE,
+        ), []
     found = _differences(both, levels.question.sampling)
     numbers = {"tasks_with_both": tasks, "shown": found.filter(pl.col("q") <= SHOWN_AT).height}
     where = f"within the {tasks} tasks that have both" if tasks > 1 else "within the one task that has both"

@@ -253,7 +253,9 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
     rows = layer_rows(item.store.attributes, item.episode, selection, question.site, per_head=True)
     parts = [part.rows.mean(axis=1, dtype=np.float64) for part in rows if part.layer in selection.once]
     mean = sum(parts, np.zeros(())) / len(parts)  # (replan, key)
-    image = mean * (tokens.static_roles == int(Role.IMAGE))
+    # Of a patch beside a picture that was fitted in, what shows the picture counts.
+    shown = np.ones(mean.shape[1]) if tokens.border is None else 1.0 - tokens.border
+    image = mean * shown * (tokens.static_roles == int(Role.IMAGE))
     uniform = mean_of_layers(uniform_keys(item, selection).mean(axis=(2, 3)), selection)
     # As much mass as the valid keys have, shared out as uniform attention does.
     uniform = uniform * ((mean * item.valid).sum(axis=1) / (uniform * item.valid).sum(axis=1))[:, None]
@@ -262,7 +264,8 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
     with np.errstate(divide="ignore", invalid="ignore"):
         for camera in cameras:
             picture = PictureMap.of(tokens.layout, camera)
-            mass, even = (picture.spread(keys[:, picture.keys]) for keys in (mean, uniform))
+            seen = mean * shown, uniform * np.where(shown > 0, shown, 1.0)
+            mass, even = (picture.spread(keys[:, picture.keys]) for keys in seen)
             beside = [span for span in tokens.layout.camera_spans(camera) if span.grid is None]
             outside = sum((mean[:, span.start : span.stop].sum(axis=1) for span in beside), np.zeros(len(mean)))
             share = mass / whole[:, None, None]

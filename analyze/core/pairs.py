@@ -55,7 +55,10 @@ def pairs_of(first: pl.DataFrame, other: pl.DataFrame, rerun: bool) -> pl.DataFr
         keys[-1] = "episode_first"
     pairs = mine.join(theirs, on=keys, how="inner")
     apart = (pl.col("seed") != pl.col("seed_other")).fill_null(False)
-    return pairs.filter(~apart).drop("seed_other").sort("suite", "task_id", "episode_first")
+    pairs = pairs.filter(~apart).sort("suite", "task_id", "episode_first", "episode_other")
+    for side in ("first", "other"):  # a seed that is not known fits several
+        pairs = pairs.unique(["suite", "task_id", f"episode_{side}"], keep="first", maintain_order=True)
+    return pairs.with_columns(seed=pl.when(pl.col("seed_other").is_not_null()).then("seed")).drop("seed_other")
 
 
 def with_first_pictures(pairs: pl.DataFrame, first: Run, other: Run) -> pl.DataFrame:

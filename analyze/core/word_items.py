@@ -46,7 +46,7 @@ def items_of(item: SelectedEpisode) -> Items:
             ):
                 item_number = members.setdefault(name, len(members))
                 cells += [(number, key, item_number) for key in word.keys]
-    named = [role for role in SCALE if (roles == role).any()]
+    named = [role for role in SCALE if (roles == role).any() or (role == Role.BORDER and tokens.has_cut_patches)]
     at = (
         np.zeros(1, np.intp)
         if len(lines) < 2
@@ -58,8 +58,11 @@ def items_of(item: SelectedEpisode) -> Items:
         of_words[tuple(np.array(cells).T)] = 1.0
         weights[..., : len(members)] = of_words[at]
     for i, role in enumerate(named, len(members)):
-        shown = 1.0 if tokens.border is None or role != Role.IMAGE else 1.0 - tokens.border
-        weights[..., i] = (roles == role) * shown
+        if tokens.border is None or role not in (Role.IMAGE, Role.BORDER):
+            weights[..., i] = roles == role
+        else:
+            seen = np.isin(roles, (Role.IMAGE, Role.BORDER))
+            weights[..., i] = seen * (tokens.border if role == Role.BORDER else 1.0 - tokens.border)
     names = [*members, *(("scale", SCALE[role], None, None) for role in named)]
     labels = {
         column: pl.Series(column, [name[i] for name in names], dtype=dtype)

@@ -139,7 +139,7 @@ def _run_outcomes(arguments: argparse.Namespace) -> int:
 
     path = arguments.store
     if arguments.remove == (arguments.file is not None):
-        raise BadArgument("Give the CSV file of outcomes, or --remove to take back what was told.")
+        raise BadArgument("Give either the CSV file of outcomes, or --remove to take back what was told.")
     if arguments.remove:
         remove_outcomes(path)
         print(f"{path}: outcomes that were told after the recording are taken back.")

@@ -167,6 +167,13 @@ def _copy(
         if tar and not present and episode_folders(target):
             raise BadArgument(f"Cannot copy tar files to {target}: its episodes are folders; give another name.")
         _refuse_others(store, target, present, building)
+        told = read_outcomes(target)
+        others = [name for name, one in store.outcomes.items() if name in told and told[name].success != one.success]
+        if others:
+            raise RunMismatch(
+                f"Cannot continue the copy {target}: it was told other outcomes of {listing(others, 4)} than "
+                f"{store.path}. Take them back: vla-attention store outcomes {target} --remove."
+            )
         added = copied = left = 0
         for episode in store.episodes:
             if episode.name not in present:
@@ -184,7 +191,7 @@ def _copy(
                 progress(1)
         if not tar:
             write_names(target, building)
-        write_outcomes(target, building, store.outcomes)
+        write_outcomes(target, building, told | store.outcomes)
     return Copied(added, len(store.episodes) - added, copied, left)
 
 

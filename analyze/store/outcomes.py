@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import episode_name
 
 COLUMNS = ("task_id", "episode_index", "success")
-_VALUES = {"1": True, "true": True, "0": False, "false": False}
+_NUMBER = re.compile(r"[0-9]{1,9}")
+_VALUES = {"1": True, "true": True, "1.0": True, "0": False, "false": False, "0.0": False}
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,11 @@ def tell_outcomes(path: Path, file: Path) -> Told:
             )
         others = [name for name, success in rows.items() if episodes[name].attributes.success not in (None, success)]
         if others:
+            recorded = [name for name in others if episodes[name].outcome is None]
+            back = f"take back what was told: vla-attention store outcomes {path} --remove"
             raise BadArgument(
-                f"{file} contradicts the outcome that {path} has of {listing(others, 4)}. What was told later is taken "
-                f"back with vla-attention store outcomes {path} --remove; what was recorded stays."
+                f"{file} contradicts the outcome that {path} has of {listing(recorded or others, 4)}: "
+                f"{'it was recorded, and stays' if recorded else back}."
             )
         new = [name for name in rows if episodes[name].attributes.success is None]
         given = {name: LaterOutcome(rows[name], episodes[name].captured) for name in new}
@@ -72,7 +76,10 @@ def _rows_of(file: Path) -> tuple[dict[str, bool], tuple[str, ...]]:
     try:
         with file.open(encoding="utf-8-sig", newline="") as lines:
             table = csv.DictReader(lines)
-            columns = tuple(table.fieldnames or ())
+            columns = tuple(name.strip() for name in table.fieldnames or ())
+            table.fieldnames = list(columns)
+            if twice := [name for name in COLUMNS if columns.count(name) > 1]:
+                raise BadArgument(f"{file} has the column {listing(twice)} more than once.")
             if missing := [name for name in COLUMNS if name not in columns]:
                 raise BadArgument(
                     f"{file} has no column {listing(missing)}; expected {listing(COLUMNS)}, found {listing(columns)}."
@@ -93,9 +100,10 @@ def _parsed(file: Path, table: csv.DictReader[str]) -> Iterator[tuple[int, str, 
     """Line, the episode's name and its outcome, of each row."""
     for row in table:
         task, index, success = (str(row[name] or "").strip() for name in COLUMNS)
-        if not (task.isdecimal() and index.isdecimal() and success.casefold() in _VALUES):
+        if None in row or not (_NUMBER.fullmatch(task) and _NUMBER.fullmatch(index) and success.casefold() in _VALUES):
             raise BadArgument(
                 f"Line {table.line_num} of {file} has task_id '{task}', episode_index '{index}' and success "
-                f"'{success}'; expected two numbers, and {listing(_VALUES)}."
+                f"'{success}'; expected as many values as columns, two whole numbers and {listing(_VALUES)}; leave out "
+                "rows of episodes whose outcome is not known."
             )
         yield table.line_num, episode_name(int(task), int(index)), _VALUES[success.casefold()]

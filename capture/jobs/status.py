@@ -133,7 +133,7 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
             task.missing = sorted(wanted - {index for task_id, index in present.values() if task_id == task.task_id})
     for name, event in drops.items():
         tasks[parse_episode_name(name)[0]].dropped.append(event)
-    scenes = SimulatedScenes()
+    scenes, told_later = SimulatedScenes(), 0
     for stored in store.episodes:
         task, folder = tasks[present[stored.name][0]], local_path(stored.folder)
         fault = look_at(store, stored, verify)
@@ -145,6 +145,7 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
         task.committed += 1
         task.success += stored.attributes.success is True
         task.unknown += stored.attributes.success is None
+        told_later += stored.is_told
         task.bytes += bytes_below(folder)
         commit = commits.get(stored.name)
         at = commit.at if commit else datetime.fromtimestamp(folder.stat().st_mtime, UTC).isoformat(timespec="seconds")
@@ -153,7 +154,7 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
     writing = tuple(episode_locks(path).holders())
     told = scenes.describe(path.name)
     return StoreStatus(
-        str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing, told, len(store.outcomes)
+        str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing, told, told_later
     )
 
 

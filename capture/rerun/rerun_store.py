@@ -106,7 +106,9 @@ class EpisodeAgain(Episode):
         attributes = self.calls.attributes
         with _reading_the_base():
             if self.done == self.calls.num_replans:
-                return Outcome(attributes.success, attributes.num_steps, self.calls.steps)
+                # What was told of the base later may be taken back there: it is not sealed here.
+                success = attributes.success if self.calls.episode.outcome is None else None
+                return Outcome(success, attributes.num_steps, self.calls.steps)
             return self.calls.again(self.caller, self.done, keep_actions=self.keep_actions)
 
 

@@ -93,8 +93,11 @@ class StoredEpisode:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are those of {stated}.")
         if self.outcome is None:
             return attributes
-        if self.outcome.seal != self.captured:
-            told = f"The outcome that was told of {self.name} is of an earlier recording of it, and is not used."
+        if not self.is_told:
+            told = (
+                f"The outcome that was told of {self.name} is of an earlier recording of it, and is not used; tell it "
+                "again with vla-attention store outcomes."
+            )
             warnings.warn(told, Note, stacklevel=2)
             return attributes
         if attributes.success not in (None, self.outcome.success):
@@ -122,6 +125,11 @@ class StoredEpisode:
     def captured(self) -> str:
         """The digest of the seal under which the episode was captured, also of a copy that leaves something out."""
         return self.seal.copied_from or self.seal.digest
+
+    @property
+    def is_told(self) -> bool:
+        """Whether an outcome was told of it after this recording."""
+        return self.outcome is not None and self.outcome.seal == self.captured
 
     @cached_property
     def files(self) -> SealedFiles:

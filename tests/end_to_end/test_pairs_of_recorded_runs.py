@@ -70,6 +70,21 @@ def test_states_pair_episodes_in_any_order_and_other_noise_parts_them(tmp_path):
     assert pairs_with(first, turned) == ([(1, True, None), (2, True, None)], 0)
 
 
+def test_a_seed_that_is_not_known_fits_one_episode_alone(tmp_path):
+    first = recorded(tmp_path / "a.zarr", PICTURES, ["it"] * EPISODES, [7, 8, 9])
+    other = recorded(tmp_path / "b.zarr", PICTURES, ["it"] * EPISODES)
+    found, _ = pairs_with(first, other)
+    assert len(found) == len({one for one, *_ in found}) == 1
+
+
+def test_runs_without_outcomes_and_pairs_are_compared(tmp_path, base):
+    """Outcomes of `va.record` may all be unknown: what does better is not known then, and the rest is."""
+    other = recorded(tmp_path / "b.zarr", 255 - PICTURES)
+    found = va.open(base).compare(other)
+    assert [line for line in found.about if "Not paired" in line]
+    assert next(one for one in found.findings if one.asks == "Which does better?").numbers == {}
+
+
 def test_an_initial_state_that_is_none_is_refused(tmp_path):
     with pytest.raises(va.UserError, match="initial state"):
         recorded(tmp_path / "a.zarr", None, [object()])

@@ -18,7 +18,7 @@ from vla_attention.analyze.store.outcomes import tell_outcomes
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.schemas.stores.outcomes import OUTCOMES_FILE
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.store_format import RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
 
 SPEC = StoreSpec(
@@ -81,6 +81,9 @@ def test_what_was_told_is_used_by_readers_and_can_be_taken_back(path, tmp_path, 
         HEAD + "0,0,maybe\n",
         HEAD + "0,-1,1\n",
         HEAD + "0,0\n",
+        HEAD + "0,0,1,1\n",
+        HEAD + "0" * 5000 + "1,0,1\n",
+        "task_id,episode_index,success,success\n0,0,1,0\n",
         HEAD,
         "task,episode,success\n0,0,1\n",
         "",
@@ -112,8 +115,11 @@ def test_copies_tar_files_and_merged_stores_keep_what_was_told(path, tmp_path):
     assert analyze(["store", "copy", str(path), str(other), "--output", str(both)]) == 0
     assert outcomes(both) == [*LATER, None, True]
     analyze(["store", "outcomes", str(path), "--remove"])
-    copy_store(open_store(path), slim, ["frames"])  # brought up to date
-    assert outcomes(slim) == RECORDED
+    copy_store(open_store(path), slim, ["frames"])  # what a copy was told stays with it
+    assert outcomes(slim) == LATER
+    tell_outcomes(path, table(tmp_path, HEAD + "0,1,1\n"))
+    with pytest.raises(RunMismatch, match="task000_episode001"):
+        copy_store(open_store(path), slim, ["frames"])
 
 
 def test_an_episode_that_is_recorded_again_has_not_the_outcome_of_the_first(path, tmp_path):

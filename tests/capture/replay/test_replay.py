@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 import zarr
 
@@ -210,6 +211,11 @@ def test_the_border_beside_a_picture_that_is_fitted_in_is_no_picture(tmp_path):
     for group, part in (("visual", 9 / 14), ("border", 5 / 14)):
         assert groups[group]["mass"] == pytest.approx(whole * part, rel=1e-4)
         assert groups[group]["keys"] == pytest.approx(8 * part)
+    scale = {row["item"]: row for row in va.open(store).words()["words"].iter_rows(named=True)}
+    assert scale["image patches"]["mass"] == pytest.approx(groups["visual"]["mass"], rel=1e-4)
+    assert scale["border of pictures"]["mass"] == pytest.approx(groups["border"]["mass"], rel=1e-4)
+    shares = va.open(store).overlay(episode=0, tasks=0)["overlay_patches"].group_by("replan").agg(pl.sum("share"))
+    np.testing.assert_allclose(shares["share"], 1.0, rtol=1e-4)
 
 
 def test_mistakes_end_with_one_line(tmp_path, capsys, monkeypatch):
