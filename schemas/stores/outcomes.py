@@ -50,9 +50,10 @@ def read_outcomes(path: StorePlace) -> dict[str, LaterOutcome]:
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except (OSError, ValueError) as error:
+        why = str(error).rstrip(".")
         raise StoreError(
-            f"The store {path} cannot be read: its {OUTCOMES_FILE}, of outcomes that were told later: {error}. "
-            f"Tell them anew: vla-attention store outcomes {path} --remove, then with the file of outcomes."
+            f"The store {path} cannot be read: its {OUTCOMES_FILE}, of outcomes that were told later: {why}. Tell them "
+            f"anew: vla-attention store outcomes {path} --remove, then with the file of outcomes."
         ) from None
     return found.outcomes
 

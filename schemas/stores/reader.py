@@ -334,10 +334,11 @@ def _from_anywhere(place: StorePlace) -> StorePlace:
     return place.absolute() if isinstance(place, Path) else place
 
 
-def open_store(path: str | StorePlace) -> Store:
+def open_store(path: str | StorePlace, *, as_recorded: bool = False) -> Store:
     """Open a store for reading, at a path or an address; its episodes are in the order of task id and episode index.
 
-    What is on the hub is read at one commit, which is in the `path` of the opened store.
+    What is on the hub is read at one commit, which is in the `path` of the opened store. as_recorded: without outcomes
+    that were told later.
     What lies among the episodes and is none is named in a `Note` and ignored.
 
     Raises:
@@ -362,7 +363,7 @@ def open_store(path: str | StorePlace) -> Store:
     for note in notes:
         warnings.warn(note, Note, stacklevel=2)
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
-    told = read_outcomes(path)
+    told = {} if as_recorded else read_outcomes(path)
     episodes = tuple(StoredEpisode(folder, folder.name, run, told.get(folder.name)) for folder in folders)
     return Store(path, root, run, episodes, tuple(notes))
 

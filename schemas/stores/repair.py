@@ -62,7 +62,7 @@ def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> lis
     """
     # Episodes are moved beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
-    store = open_store(path)
+    store = open_store(path, as_recorded=True)
     _check_root(store)
     looks = [(episode, look_at(store, episode, verify)) for episode in store.episodes]
     damaged = [(episode, fault) for episode, fault in looks if fault is not None]
@@ -146,7 +146,7 @@ def repair_groups(path: Path, dry_run: bool = False) -> list[str]:
         A line on every file beside the episodes that is wrong, also on the root's, which nobody can write again.
     """
     lines = []
-    for fault in store_faults(open_store(path)):
+    for fault in store_faults(open_store(path, as_recorded=True)):
         if fault.where == EPISODES_DOCUMENT:
             if not dry_run:
                 building = path / f".{uuid.uuid4().hex}"

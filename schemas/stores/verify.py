@@ -21,6 +21,8 @@ from vla_attention.schemas.stores.root import NAMES_FILE, group_attributes, name
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode, Problem, StoreError
 
+#: What to do about the outcomes that were told after a recording.
+_TELL_ANEW = "take them back with vla-attention store outcomes STORE --remove, and tell them anew"
 _ROOT_FILES = ("zarr.json", EPISODES_DOCUMENT)
 #: quick: seals, metadata, and the presence and size of every file. files: every byte is compared with the seal, too.
 #: values: all arrays are read, and the rules that the writer applies are applied again (`episode_checks.py`).
@@ -94,9 +96,15 @@ def store_faults(store: Store) -> list[Fault]:
         names = [episode.name for episode in store.episodes]
         if (store.path / NAMES_FILE).read_bytes() != names_document(names):
             faults.append(Fault(NAMES_FILE, "it lists other episodes than are there; web servers give those it lists"))
-    strangers = sorted(read_outcomes(store.path).keys() - {episode.name for episode in store.episodes})
+    try:
+        strangers = sorted(read_outcomes(store.path).keys() - {episode.name for episode in store.episodes})
+    except StoreError:
+        faults.append(Fault(OUTCOMES_FILE, f"it is damaged: {_TELL_ANEW}"))
+        strangers = []
     if strangers:
-        faults.append(Fault(OUTCOMES_FILE, f"it has outcomes of {listing(strangers, 4)}, which are not there"))
+        faults.append(
+            Fault(OUTCOMES_FILE, f"it has outcomes of {listing(strangers, 4)}, which are not there: {_TELL_ANEW}")
+        )
     return faults
 
 
@@ -169,7 +177,7 @@ def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> Damag
 
 def find_damaged(path: Path, names: Collection[str], verify: bool = False) -> list[DamagedEpisode]:
     """Return the damaged episodes among those named. An episode that the store lacks is not damaged."""
-    store = open_store(path)
+    store = open_store(path, as_recorded=True)
     looks = (look_at(store, episode, verify) for episode in store.episodes if episode.name in names)
     return [damaged for damaged in looks if damaged is not None]
 

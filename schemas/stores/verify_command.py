@@ -102,7 +102,7 @@ def _verified(path: StorePlace, depth: Depth, reports: Reports, *, as_json: bool
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Note)  # what lies among the episodes is named below
-        store = open_store(path)
+        store = open_store(path, as_recorded=True)
     faults, foreign = store_faults(store), foreign_in_store(store)
     found: list[EpisodeReport] = []
     for fault in faults:
@@ -143,7 +143,9 @@ def run_repair(stores: Sequence[Path], *, verify: bool, dry_run: bool) -> int:
     for path in stores:
         findings = repair_store(path, verify, dry_run)
         mended = repair_groups(path, dry_run)
-        total = len(open_store(path).episodes) + sum(finding.moved_to is not None for finding in findings)
+        total = len(open_store(path, as_recorded=True).episodes) + sum(
+            finding.moved_to is not None for finding in findings
+        )
         for line in (*_lines(path, findings, total, verify, dry_run), *mended, *_leftovers(path, dry_run)):
             print_line(line)
         if dry_run:

@@ -132,7 +132,7 @@ def test_an_episode_that_is_recorded_again_has_not_the_outcome_of_the_first(path
         assert outcomes(path) == [None, False, None, True]
 
 
-def test_a_damaged_file_of_outcomes_is_refused(path, tmp_path):
+def test_a_damaged_file_of_outcomes_is_refused(path, tmp_path, capsys):
     tell_outcomes(path, table(tmp_path, TOLD))
     document = json.loads((path / OUTCOMES_FILE).read_text())
     document["outcomes"]["task000_episode001"]["success"] = True
@@ -140,3 +140,9 @@ def test_a_damaged_file_of_outcomes_is_refused(path, tmp_path):
         (path / OUTCOMES_FILE).write_text(content)
         with pytest.raises(StoreError, match=OUTCOMES_FILE):
             open_store(path)
+        # The episodes are whole, and what closes the store can be taken away.
+        assert analyze(["store", "verify", str(path), "--quick"]) == 1
+        assert OUTCOMES_FILE in capsys.readouterr().out
+        assert [fault.where for fault in verify_store(open_store(path, as_recorded=True))] == [OUTCOMES_FILE]
+    assert analyze(["store", "outcomes", str(path), "--remove"]) == 0
+    assert analyze(["store", "verify", str(path), "--quick"]) == 0
