@@ -7,7 +7,7 @@ into the prompt; they are stored beside the rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Literal
 
@@ -172,20 +172,13 @@ class PatchGrid(Document, frozen=True):
 
     def shown(self, part: Part) -> NDArray[np.float64]:
         """How much of every patch lies in a part of the whole picture, (patch,), from 0 to 1."""
-        along = [
-            np.clip(
-                (np.minimum(centre + half, first + length) - np.maximum(centre - half, first)) / (2 * half), 0.0, 1.0
+        down, across = (
+            _shares(patches, (first - begins) / whole, length / whole, 1)[:, 0]
+            for patches, first, length, begins, whole in zip(
+                (self.rows, self.columns), self.part[:2], self.part[2:], part[:2], part[2:], strict=True
             )
-            for centre, half, first, length in zip(
-                self.centres(),
-                (self.part[2] / self.rows / 2, self.part[3] / self.columns / 2),
-                part[:2],
-                part[2:],
-                strict=True,
-            )
-        ]
-        areas, whole = (areas := np.outer(*along).ravel()), np.rint(areas)
-        return np.where(np.abs(areas - whole) < 1000 * _ROUNDING, whole, areas)
+        )
+        return np.outer(down, across).ravel()
 
     def describe(self) -> str:
         """The grid in words."""
@@ -461,41 +454,6 @@ def prompt_at(sites: Sequence[SiteLayout], layout: SiteLayout, prompt: Prompt) -
         if span is not None and span_here is not None and piece.key - span.start < span_here.num_keys:
             pieces.append(replace(piece, key=piece.key - span.start + span_here.start))
     return replace(prompt, pieces=tuple(pieces))
-
-
-def fitted_part(given: tuple[int, int], size: tuple[int, int], towards: float = 0.5) -> Part:
-    """The part of a picture of a model that shows a camera's picture, resized with its aspect ratio kept.
-
-    given, size: height and width in pixels of the camera's picture and of the model's. towards: where it lies in the
-    room that is left, 0.5 in the middle.
-    """
-    factor = max(mine / other for mine, other in zip(given, size, strict=True))
-    inner = [max(1, int(side / factor)) for side in given]
-    before = [int((whole - side) * towards) for whole, side in zip(size, inner, strict=True)]
-    (height, width), (rows, columns), (top, left) = size, inner, before
-    return top / height, left / width, rows / height, columns / width
-
-
-def borders(layout: SiteLayout, shown: Mapping[str, Part]) -> NDArray[np.float32] | None:
-    """How much of each key's patch shows no picture, (key,); None where all patches show one.
-
-    shown: camera -> the part of the model's picture that shows the camera's; all of it for others.
-    """
-    found = np.zeros(layout.num_keys, dtype=np.float32)
-    for camera, part in shown.items():
-        if camera in layout.pictured:
-            found[layout.patch_keys(camera)] = 1.0 - np.concatenate([grid.shown(part) for grid in layout.grids(camera)])
-    return found if found.any() else None
-
-
-def with_borders(layout: SiteLayout, roles: NDArray[np.uint8], shown: Mapping[str, Part]) -> NDArray[np.uint8]:
-    """Roles (key,) with `border` for the patches that show no picture at all."""
-    of_keys = borders(layout, shown)
-    if of_keys is None:
-        return roles
-    marked = roles.copy()
-    marked[(of_keys == 1.0) & (roles == Role.IMAGE)] = Role.BORDER
-    return marked
 
 
 def roles_from_spans(layout: SiteLayout, role_of_span: dict[str, Role]) -> NDArray[np.uint8]:

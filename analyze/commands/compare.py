@@ -86,13 +86,11 @@ def _outcome(run: Run, first: Run) -> str:
         calls = f"the policy calls of {plural(len(run.question.selected), 'episode')} of {first.name} again"
         return f"{calls}, with {run.changed}; outcome not run"
     policy = run.stores[0].attributes.policy.name
-    outcomes = [item.episode.attributes.success for item in run.question.selected]
-    return f"{policy} on {listing(run.suites)}, {solved(outcomes, run.question.num_tasks)}"
+    return f"{policy} on {listing(run.suites)}, {solved(_outcomes(run), run.question.num_tasks)}"
 
 
-def _outcomes(run: Run) -> list[bool]:
-    """Of each episode whether its outcome is known."""
-    return [item.episode.attributes.success is not None for item in run.question.selected]
+def _outcomes(run: Run) -> list[bool | None]:
+    return [item.episode.attributes.success for item in run.question.selected]
 
 
 def _how_alike(part: Compared) -> list[str]:
@@ -195,7 +193,7 @@ def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame)
 def _success(part: Compared) -> Finding:
     """Won and lost with the exact test, and what the pairs could have shown; without pairs, both shares."""
     first, name = part.first.run.name, part.name
-    unknown = [run.name for run in (part.first.run, part.other.run) if not any(_outcomes(run))]
+    unknown = [run.name for run in (part.first.run, part.other.run) if all(one is None for one in _outcomes(run))]
     if unknown:
         later = "vla-attention store outcomes STORE FILE.csv tells outcomes that a scorer or a person gives later."
         return Finding(f"No outcome is known of {listing(unknown)}.", _BETTER, limit=later)

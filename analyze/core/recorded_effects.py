@@ -201,7 +201,8 @@ def recorded_effects(
         for at, selectors in places
         if at.site != question.site
     ]
-    silent = {block for item in having for block in getattr(item.episode.attributes.effects, "silent_blocks", ())}
+    effects = (item.episode.attributes.effects for item in having)
+    silent = {block for one in effects if one is not None for block in one.silent_blocks}
     hybrid = (
         f"Through softmax only, also where nobody reads it: keys are not cut off in {plural(len(silent), 'block')} "
         f"without softmax attention ({listing(sorted(silent), 3)}). Exchanges of words and pictures are whole."

@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.fitted_pictures import fitted_box, fitted_part
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.layout import WHOLE, Part, Prompt, camera_grids, fitted_part, picture_size
+from vla_attention.schemas.layout import WHOLE, Part, Prompt, camera_grids, picture_size
 from vla_attention.schemas.safe_text import check_text
 
 
@@ -233,10 +234,10 @@ def model_picture(
     height, width = size
     if fit == "stretch":
         return _resized(levels, height, width), WHOLE
-    part = fitted_part((levels.shape[0], levels.shape[1]), size, 1.0 if fit == "pad_left_top" else 0.5)
-    top, left, rows, columns = (round(side * whole) for side, whole in zip(part, size * 2, strict=True))
-    inner = _resized(levels, rows, columns)
-    return np.pad(inner, ((top, height - rows - top), (left, width - columns - left), (0, 0))), part
+    given, towards = (levels.shape[0], levels.shape[1]), 1.0 if fit == "pad_left_top" else 0.5
+    top, left, rows, columns = fitted_box(given, size, towards)
+    padding = ((top, height - rows - top), (left, width - columns - left), (0, 0))
+    return np.pad(_resized(levels, rows, columns), padding), fitted_part(given, size, towards)
 
 
 def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:

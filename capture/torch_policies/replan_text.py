@@ -21,7 +21,8 @@ from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, Rec
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit, TokenText, find_instruction, state_pieces
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
-from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role, roles_from_spans, with_borders
+from vla_attention.schemas.fitted_pictures import with_borders
+from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role, roles_from_spans
 
 
 class KeysShifted(BadArgument):

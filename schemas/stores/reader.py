@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import Note, listing
+from vla_attention.schemas.fitted_pictures import border_of_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
-from vla_attention.schemas.layout import Prompt, borders, prompt_at
+from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.outcomes import LaterOutcome, read_outcomes
@@ -262,7 +263,7 @@ class StoredEpisode:
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
             coverage=self.coverage(root, site),
-            border=borders(layout, self.attributes.shown),
+            border=border_of_keys(layout, self.attributes.shown),
         )
 
     def prompts(self, root: RootAttributes, site: str) -> tuple[Prompt, ...]:

@@ -8,9 +8,10 @@ import numpy as np
 from hypothesis import strategies as st
 
 from tests.kit.tokens import SpelledPrompt, spell_prompt, tokens_of
+from vla_attention.schemas.fitted_pictures import border_of_keys, with_borders
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, ObjectKind, SceneObject
-from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind, borders, with_borders
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind
 
 NOUNS = ("bowl", "plate", "drawer", "stove", "mug")
 #: Parts of its picture that a span of a camera covers; None: a token that lies nowhere in it.
@@ -72,7 +73,7 @@ def episode_tokens(draw: st.DrawFn, fitted: bool = False) -> EpisodeTokens:
         return tokens
     shown = {camera: part for camera in coverage if (part := draw(st.sampled_from(SHOWN))) is not None}
     roles = np.stack([with_borders(layout, of_replan, shown) for of_replan in tokens.key_role])
-    return replace(tokens, key_role=roles, border=borders(layout, shown))
+    return replace(tokens, key_role=roles, border=border_of_keys(layout, shown))
 
 
 @st.composite

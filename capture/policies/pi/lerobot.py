@@ -24,6 +24,7 @@ from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline
 from vla_attention.capture.policies.pi.processing import Processing, simulated_arm, simulator_cameras
 from vla_attention.capture.policies.pi.sizes import stated_config
 from vla_attention.capture.policies.robot import IMAGES, Robot
+from vla_attention.schemas.fitted_pictures import fitted_box
 
 #: LeRobot's names for the pictures of its LIBERO environment -> the simulator's cameras.
 LIBERO_CAMERAS = {IMAGES + "image": "agentview", IMAGES + "image2": "robot0_eye_in_hand"}
@@ -37,11 +38,9 @@ def lerobot_image(picture: NDArray[np.uint8], size: int) -> Tensor:
     image = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)))[None].float() / 255.0
     height, width = image.shape[2:]
     if (height, width) != (size, size):
-        ratio = max(width / size, height / size)
-        fitted = (int(height / ratio), int(width / ratio))
-        image = F.interpolate(image, size=fitted, mode="bilinear", align_corners=False).clamp(0.0, 1.0)
-        below, right = size - fitted[0], size - fitted[1]
-        image = F.pad(image, (right // 2, right - right // 2, below // 2, below - below // 2))
+        top, left, rows, columns = fitted_box((height, width), (size, size))
+        image = F.interpolate(image, size=(rows, columns), mode="bilinear", align_corners=False).clamp(0.0, 1.0)
+        image = F.pad(image, (left, size - columns - left, top, size - rows - top))
     return image * 2.0 - 1.0
 
 

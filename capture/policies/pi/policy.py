@@ -32,18 +32,9 @@ from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Poli
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.fitted_pictures import fitted_part, with_borders
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import (
-    WHOLE,
-    PatchGrid,
-    Role,
-    SiteLayout,
-    Span,
-    SpanKind,
-    fitted_part,
-    roles_from_spans,
-    with_borders,
-)
+from vla_attention.schemas.layout import WHOLE, PatchGrid, Role, SiteLayout, Span, SpanKind, roles_from_spans
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 

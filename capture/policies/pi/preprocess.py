@@ -19,6 +19,7 @@ from PIL import Image
 from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.fitted_pictures import fitted_box
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 
 NormalisationMode = Literal["quantile", "z-score"]
@@ -42,12 +43,10 @@ def resize_with_pad(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     height, width = image.shape[:2]
     if (height, width) == (size, size):
         return image
-    ratio = max(width / size, height / size)
-    fitted_width, fitted_height = int(width / ratio), int(height / ratio)
-    resized = Image.fromarray(image).resize((fitted_width, fitted_height), Image.Resampling.BILINEAR)
+    top, left, rows, columns = fitted_box((height, width), (size, size))
+    resized = Image.fromarray(image).resize((columns, rows), Image.Resampling.BILINEAR)
     canvas = np.zeros((size, size, 3), dtype=np.uint8)
-    top, left = max(0, (size - fitted_height) // 2), max(0, (size - fitted_width) // 2)
-    canvas[top : top + fitted_height, left : left + fitted_width] = np.asarray(resized)
+    canvas[top : top + rows, left : left + columns] = np.asarray(resized)
     return canvas
 
 

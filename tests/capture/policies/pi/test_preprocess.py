@@ -25,7 +25,8 @@ from vla_attention.capture.policies.pi.processing import openpi_processing, simu
 from vla_attention.capture.policies.pi.tokenizer import digitise_state
 from vla_attention.capture.torch_policies.replan_inputs import model_picture
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.layout import PatchGrid, fitted_part
+from vla_attention.schemas.fitted_pictures import fitted_part
+from vla_attention.schemas.layout import PatchGrid
 
 FOLDER = GOLDEN / "libero_preproc"
 MODES = {"z-score": "z", "quantile": "q"}
