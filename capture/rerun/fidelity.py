@@ -15,7 +15,7 @@ from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rerun.base_store import machine_differences
 from vla_attention.capture.rerun.stored_calls import StoredCalls
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, as_read
 from vla_attention.schemas.stores.store_format import Recording, StoreError
 
 #: Called with the number of policy calls done.
@@ -96,7 +96,7 @@ def check_fidelity(
         actions.append(call.actions)
         for site, recorded in call.rows.items():
             stored = calls.episode.read(f"{site}/rows", replan)
-            difference = np.abs(round_mantissa(recorded.rows, recording.mantissa_bits) - stored)
+            difference = np.abs(as_read(recorded.rows, recording.mantissa_bits) - stored)
             largest = max(largest, float(difference.max()))
             changed, count = changed + int(np.count_nonzero(difference)), count + difference.size
         report(replan + 1)

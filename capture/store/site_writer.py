@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,12 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.codecs import create_rows, encode_row_chunk, replans_per_block
+from vla_attention.capture.store.codecs import RowCodec, create_rows, keys_per_chunk, replans_per_block
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout
-from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, to_stored
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
 from vla_attention.schemas.stores.array_metadata import chunk_file
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, ArrayDigest, crc32c
@@ -36,26 +37,38 @@ from vla_attention.schemas.stores.store_format import (
 
 
 class ShardWriter:
-    """A float32 array (replan, layer, denoise, ...), whose file grows by blocks of replans; one block is in memory."""
+    """An array (replan, layer, denoise, ..., key), whose file grows by blocks of replans; one block is in memory."""
 
-    def __init__(self, group: zarr.Group, folder: Path, name: str, cells: tuple[int, ...]) -> None:
-        """Begin the array `name` of the episode's `group`, whose folder it is; `cells` are its axes (layer, ...)."""
+    def __init__(
+        self, group: zarr.Group, folder: Path, name: str, cells: tuple[int, ...], bits: int, keys: int | None = None
+    ) -> None:
+        """Begin the array `name` of the episode's `group`, whose folder it is.
+
+        cells: its axes (layer, denoise, ..., key). bits: mantissa bits of its probabilities. keys: of a chunk; all
+        unless given.
+        """
         self.group = group
         self.name = name
         self.cells = cells
-        self.bytes_per_replan = 4 * math.prod(cells[2:])
-        self.block = replans_per_block(self.bytes_per_replan)
+        self.bits = bits
+        self.codec = RowCodec.of_bits(bits)
+        self.keys = keys or cells[-1]
+        self.block = self._replans_per_block()
         self.file = folder / name / chunk_file(1 + len(cells))
         self.file.parent.mkdir()
         self.num_replans = 0
         self.digest = ArrayDigest()
-        self._pending: list[NDArray[np.float32]] = []
+        self._pending: list[NDArray[Any]] = []
         self._index: list[tuple[int, int]] = []
         self._size = 0
 
+    def _replans_per_block(self, count: int | None = None) -> int:
+        rest = math.prod(self.cells[2:-1])
+        return replans_per_block(self.codec.itemsize * rest * self.cells[-1], rest * self.keys, count)
+
     def append(self, values: NDArray[np.float32]) -> None:
-        """Add the next replan, (layer, denoise, ...)."""
-        self._pending.append(values)
+        """Add the probabilities of the next replan, (layer, denoise, ..., key)."""
+        self._pending.append(to_stored(values, self.bits))
         if len(self._pending) == self.block:
             self._flush()
 
@@ -63,17 +76,20 @@ class ShardWriter:
         values = np.stack(self._pending)
         self._pending.clear()
         if not self.num_replans:
-            self.block = replans_per_block(self.bytes_per_replan, len(values))
-        # What a last block lacks is never read; it has the fill value, as zarr-python would write it.
-        chunk = np.full((self.block, *self.cells[2:]), np.nan, dtype="<f4")
+            self.block = self._replans_per_block(len(values))
+        num_keys = self.cells[-1]
+        # What a chunk has beyond the last replan or key is never read. Beyond the last replan it is the fill value, as
+        # zarr-python would write it; in every row zeros take less room.
+        chunk = np.full((self.block, *self.cells[2:-1], self.keys), np.nan, dtype=self.codec.dtype)
         with self.file.open("ab") as file:
-            for layer in range(self.cells[0]):
-                for denoise in range(self.cells[1]):
-                    chunk[: len(values)] = values[:, layer, denoise]
-                    encoded = _with_checksum(encode_row_chunk(chunk))
-                    file.write(encoded)
-                    self._index.append((self._size, len(encoded)))
-                    self._size += len(encoded)
+            for layer, denoise, first in product(*map(range, self.cells[:2]), range(0, num_keys, self.keys)):
+                part = values[:, layer, denoise, ..., first : first + self.keys]
+                chunk[: len(values), ..., : part.shape[-1]] = part
+                chunk[: len(values), ..., part.shape[-1] :] = 0
+                encoded = _with_checksum(self.codec.encode(chunk))
+                file.write(encoded)
+                self._index.append((self._size, len(encoded)))
+                self._size += len(encoded)
         self.num_replans += len(values)
         self.digest.update(values)
 
@@ -85,7 +101,7 @@ class ShardWriter:
         with self.file.open("ab") as file:
             file.write(_with_checksum(index))
         shape = (self.num_replans, *self.cells)
-        create_rows(self.group, self.name, shape, self.block, axes)
+        create_rows(self.group, self.name, shape, (self.block, self.keys), axes, self.codec)
         return ArrayRecord(shape, self.digest.hexdigest())
 
 
@@ -114,7 +130,8 @@ class SiteWriter:
         self.others: list[dict[str, NDArray[Any]]] = []
         self.segments: tuple[Segment, ...] = ()
         group.create_group(layout.name, attributes=to_json(recording.axis_numbers))
-        self.rows = ShardWriter(group, folder, f"{layout.name}/rows", (*self.shape, layout.num_keys))
+        cells, keys = (*self.shape, layout.num_keys), keys_per_chunk(layout)
+        self.rows = ShardWriter(group, folder, f"{layout.name}/rows", cells, recording.mantissa_bits, keys)
 
     def arrays(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """Path in the episode -> values of one replan, with an axis of length 1 for it; `append` adds them."""
@@ -136,7 +153,7 @@ class SiteWriter:
         members = segment_members(self.layout, key_role[None], segments)[0]
         # Atoms and sums come from the rows as computed, so that the rounded rows can be compared with them.
         self.masses.append((segments, segment_masses(recorded.rows, members)))
-        self.rows.append(round_mantissa(recorded.rows, self.recording.mantissa_bits))
+        self.rows.append(recorded.rows)
         arrays = self.arrays(recorded, key_role)
         del arrays[f"{self.layout.name}/rows"]
         self.others.append(arrays)
@@ -161,24 +178,31 @@ class SiteWriter:
                 grams[replan][..., parts[:, None], parts] = gram
             self.write(f"{name}/contribution", grams, CONTRIBUTION_AXES)
         self.write(f"{name}/row_sum", np.stack(self._of_replans("row_sum")), ROW_AXES[:-1])
-        self.write(f"{name}/key_role", np.stack(self._of_replans("key_role")), ("replan", "key"))
-        return {f"{name}/rows": self.rows.finish(ROW_AXES), f"{name}/uniform": self._write_uniform()}
+        roles = np.stack(self._of_replans("key_role"))
+        self.write(f"{name}/key_role", roles, ("replan", "key"))
+        return {f"{name}/rows": self.rows.finish(ROW_AXES)} | self._write_uniform(roles)
 
     def _of_replans(self, kind: str) -> list[NDArray[Any]]:
         return [arrays[f"{self.layout.name}/{kind}"][0] for arrays in self.others]
 
-    def _write_uniform(self) -> ArrayRecord:
-        """Write what uniform attention gives, once along every axis along which it is the same."""
+    def _write_uniform(self, key_role: NDArray[np.uint8]) -> dict[str, ArrayRecord]:
+        """Write what uniform attention gives, once along every axis along which it is the same.
+
+        Nothing is written where every query sees all keys that the roles (replan, key) let it see.
+        """
         uniforms = self._of_replans("uniform")
         cells = np.broadcast_shapes(*(uniform.shape for uniform in uniforms))
         uniform = np.stack([np.broadcast_to(of_replan, cells) for of_replan in uniforms])
+        if (uniform == uniform_of_roles(key_role)[:, None, None, None, None].astype(np.float32)).all():
+            return {}
         for axis in range(uniform.ndim - 1):
             first = uniform.take([0], axis=axis)
             uniform = first if (uniform == first).all() else uniform
         # In the layout of rows: masks may differ in as many ways, and an analysis reads its layers only.
-        shard = ShardWriter(self.group, self.folder, f"{self.layout.name}/uniform", uniform.shape[1:])
+        name = f"{self.layout.name}/uniform"
+        shard = ShardWriter(self.group, self.folder, name, uniform.shape[1:], FLOAT32_MANTISSA_BITS)
         for of_replan in uniform:
             shard.append(of_replan)
         # Axes of one name have one length in a group, or xarray does not open it.
         lengths = zip(ROW_AXES, uniform.shape, (len(uniforms), *self.shape, self.layout.num_keys), strict=True)
-        return shard.finish([axis if n == m else f"any_{axis}" for axis, n, m in lengths])
+        return {name: shard.finish([axis if n == m else f"any_{axis}" for axis, n, m in lengths])}

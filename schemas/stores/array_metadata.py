@@ -2,6 +2,8 @@
 
 An array is one file, a chunk or a shard of chunks, and a chunk has the codecs bytes (little-endian), blosc and crc32c
 (`capture/store/codecs.py` writes them). Another layout is refused; zarr-python reads it.
+
+Numbers of the type float16 are probabilities x 2^15 (`schemas/precision.py`), and have the attribute `scale_factor`.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vla_attention.schemas.precision import HALF_SCALE
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 _CODECS = ["bytes", "blosc", "crc32c"]
@@ -38,6 +41,16 @@ class ArrayMetadata:
     axes: tuple[str, ...]
 
     @property
+    def is_half(self) -> bool:
+        """Whether the numbers are probabilities in float16."""
+        return self.dtype == np.dtype("<f2")
+
+    @property
+    def read_dtype(self) -> np.dtype[Any]:
+        """The type of the numbers as they are read."""
+        return np.dtype(np.float32) if self.is_half else self.dtype
+
+    @property
     def file(self) -> str:
         """The name of the array's only file in its folder."""
         return chunk_file(len(self.shape))
@@ -46,6 +59,11 @@ class ArrayMetadata:
     def grid(self) -> tuple[int, ...]:
         """Number of chunks along each axis."""
         return tuple(-(-extent // part) for extent, part in zip(self.shape, self.chunk_shape, strict=True))
+
+    def whole_chunks(self, first: int, stop: int) -> range:
+        """The indices along the last axis of all chunks that hold some from `first` to `stop`."""
+        of_chunk, length = self.chunk_shape[-1], self.shape[-1]
+        return range(first // of_chunk * of_chunk, min(length, -(-stop // of_chunk) * of_chunk))
 
 
 def chunk_file(axes: int) -> str:
@@ -77,6 +95,9 @@ def array_metadata(document: Any) -> ArrayMetadata:
         one_file = all(extent <= most for extent, most in zip(shape, of_file, strict=True))
         if of_chunk != _CODECS or not one_file or any(rest for _, rest in chunks):
             raise ValueError(f"the codecs {of_chunk}, files of {of_file} and chunks of {chunk} for the shape {shape}")
+        scale = document.get("attributes", {}).get("scale_factor")
+        if scale != (HALF_SCALE if dtype == np.dtype("<f2") else None):
+            raise ValueError(f"numbers of the type {dtype} with the scale_factor {scale}")
         return ArrayMetadata(
             tuple(shape),
             dtype,
@@ -84,5 +105,5 @@ def array_metadata(document: Any) -> ArrayMetadata:
             None if shard is None else math.prod(count for count, _ in chunks),
             tuple(document["dimension_names"]),
         )
-    except (LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise CorruptEpisode(f"its zarr.json is not that of an array of this format: {error}") from None

@@ -65,7 +65,11 @@ def form_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Prob
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
     for name in sorted(set(shapes) - set(listed)):
-        yield Problem(f"{name} is not in the episode")
+        if not name.endswith("/uniform"):  # where the roles of the keys say it
+            yield Problem(f"{name} is not in the episode")
+    for site in root.sites:
+        if f"{site.name}/rows" in listed:
+            yield from _guarded(_type_problems(root, episode, site.name))
     for name, shape in listed.items():
         yield from map(Problem, shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
 
@@ -94,6 +98,11 @@ def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dic
     return shapes
 
 
+def _type_problems(root: RootAttributes, episode: StoredEpisode, site: str) -> Iterator[str]:
+    episode.check_rows(root, site)
+    yield from ()
+
+
 def _guarded(check: Iterator[str]) -> Iterator[Problem]:
     """The problems that a check finds; an array or file that it cannot read is one more."""
     try:
@@ -111,13 +120,15 @@ def _array_problems(
     def whole(beside: str) -> NDArray[Any]:
         if beside in wrong:
             raise CorruptEpisode(f"{beside} does not fit the episode")
-        return episode.read(beside)
+        site, _, kind = beside.partition("/")
+        return episode.uniform(site) if kind == "uniform" else episode.read(beside)
 
     digest, problems = ArrayDigest(), list[str]()
     step = episode.reading_step(name)
     for first in range(0, episode.shape_of(name)[0], step):
-        values = episode.read(name, slice(first, first + step))
-        digest.update(values)
+        stored = episode.read_stored(name, first, min(first + step, episode.shape_of(name)[0]))
+        digest.update(stored)
+        values = episode.values_of(name, stored)
 
         def of_block(beside: str, first: int = first) -> NDArray[Any]:
             # What uniform attention gives may be stored once for all replans.

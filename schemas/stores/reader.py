@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import Note, listing
 from vla_attention.schemas.fitted_pictures import border_of_keys
+from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.layout import Prompt, prompt_at
+from vla_attention.schemas.precision import is_half
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.outcomes import LaterOutcome, read_outcomes
@@ -35,7 +37,6 @@ from vla_attention.schemas.stores.store_format import (
     EpisodeAttributes,
     EpisodeSeal,
     RootAttributes,
-    StoreError,
     episode_name,
     parse_episode_name,
 )
@@ -80,13 +81,7 @@ class StoredEpisode:
         """The episode's attributes; its success is what was told later, where the recording knew none."""
         document = self.document("zarr.json")
         try:
-            given = attributes_in(document)
-            if isinstance(effects := given.get("effects"), dict) and "conditions" in effects and "items" not in effects:
-                raise StoreError(
-                    f"The effects of episode {self.name} were recorded before they named their items; bring the store "
-                    "up to date: python scripts/convert_effects.py STORE (of the project's repository)."
-                )
-            attributes = from_json(EpisodeAttributes, given)
+            attributes = from_json(EpisodeAttributes, attributes_in(document))
         except MalformedDocument as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
         stated = episode_name(attributes.task_id, attributes.episode_index)
@@ -185,7 +180,7 @@ class StoredEpisode:
     def reading_step(self, name: str) -> int:
         """Indices along the first axis of an array that are read at once: all, or of large arrays those of a chunk."""
         about = self.array(name).metadata
-        whole = about.dtype.itemsize * math.prod(about.shape) <= READ_AT_ONCE_BYTES
+        whole = about.read_dtype.itemsize * math.prod(about.shape) <= READ_AT_ONCE_BYTES
         return max(1, about.shape[0]) if whole else about.chunk_shape[0]
 
     def read(self, name: str, index: int | slice = slice(None)) -> NDArray[Any]:
@@ -199,12 +194,20 @@ class StoredEpisode:
         numbers = self._numbers_as_array(name)
         if numbers is not None:
             return np.asarray(numbers[index])
-        array = self.array(name)
-        indices = range(array.metadata.shape[0])
+        indices = range(self.shape_of(name)[0])
         chosen = indices[index] if isinstance(index, slice) else range(indices[index], indices[index] + 1)
-        values = self._readable(name, lambda: array.read(chosen.start, max(chosen.start, chosen.stop)))
-        self.refuse_missing(name, values)
+        values = self.values_of(name, self.read_stored(name, chosen.start, chosen.stop))
         return values[0] if isinstance(index, int) else values
+
+    def read_stored(self, name: str, first: int, stop: int) -> NDArray[Any]:
+        """Numbers of one array as they are stored, from one index along the first axis to another; see `values_of`."""
+        return self._readable(name, lambda: self.array(name).read_stored(first, max(first, stop)))
+
+    def values_of(self, name: str, stored: NDArray[Any]) -> NDArray[Any]:
+        """What the stored numbers of an array stand for; `CorruptEpisode` where a chunk of them is missing."""
+        values = self._readable(name, lambda: self.array(name).values_of(stored))
+        self.refuse_missing(name, values)
+        return values
 
     def _numbers_of(self, name: str) -> tuple[float, ...]:
         return getattr(self.attributes, name) if name in NUMBERS else ()
@@ -227,13 +230,15 @@ class StoredEpisode:
         self.refuse_missing(name, values)
         return values
 
-    def read_layers(self, name: str, places: Iterable[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
+    def read_layers(
+        self, name: str, places: Iterable[tuple[int, int]], keys: range | None = None
+    ) -> Iterator[NDArray[np.float32]]:
         """Layers and denoise steps of an array as `read_layer` gives them, one after the other in the same memory.
 
         Each is gone when the next one is asked for. They are not searched for missing values: give `refuse_missing`
-        what is made of them, which has far fewer numbers.
+        what is made of them, which has far fewer numbers. keys: whole chunks of them, see `StoredArray.layers`.
         """
-        layers = self.array(name).layers(places)
+        layers = self.array(name).layers(places, keys)
         while (values := self._readable(name, lambda: next(layers, None))) is not None:
             yield values
 
@@ -250,8 +255,34 @@ class StoredEpisode:
         if _holds_missing(values) or (name.endswith("/key_role") and not values.all()):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
 
+    def uniform(self, site: str) -> NDArray[np.float32]:
+        """What uniform attention gives in the place of each row, with the axes of `SITE/rows`.
+
+        An axis along which nothing changes may have length 1. It is stored where the roles of the keys do not say it.
+        """
+        name = f"{site}/uniform"
+        if self.has(name):
+            values: NDArray[np.float32] = self.read(name)
+            return values
+        return self.uniform_of_roles(site)
+
+    def uniform_of_roles(self, site: str) -> NDArray[np.float32]:
+        """`uniform` where every query sees all keys whose roles let it see them, (replan, 1, 1, 1, 1, key)."""
+        return uniform_of_roles(self.read(f"{site}/key_role"))[:, None, None, None, None].astype(np.float32)
+
+    def check_rows(self, root: RootAttributes, site: str) -> None:
+        """Raise `CorruptEpisode` when the rows of a site are not stored as float16 or float32 as their precision is."""
+        stored, bits = self.array(f"{site}/rows").metadata, root.recording.mantissa_bits
+        if stored.is_half is not is_half(bits):
+            raise CorruptEpisode(
+                f"Array {site}/rows of episode {self.name} has the type {stored.dtype.name}; expected "
+                f"{'float16' if is_half(bits) else 'float32'} for {bits} mantissa bits. A store of before 29 November "
+                "2026 is brought up to date by: python scripts/convert_store.py STORE (of the project's repository)."
+            )
+
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
+        self.check_rows(root, site)
         layout = root.site(site)
         roles = self.read(f"{site}/key_role")
         same = bool((roles == roles[:1]).all())

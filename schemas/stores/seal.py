@@ -20,9 +20,9 @@ from msgspec.structs import replace
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.stores.array_metadata import array_metadata
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.digest import bytes_digest
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest
 from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.schemas.stores.sealed_files import index_size
+from vla_attention.schemas.stores.sealed_files import index_places, index_size
 from vla_attention.schemas.stores.store_format import SEAL_GROUP, EpisodeSeal, FileRecord
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
@@ -95,4 +95,6 @@ def _file_record(path: Path, chunks: int | None) -> FileRecord:
         if chunks is None:
             return record
         stored = os.pread(file.fileno(), index_size(chunks), max(0, size - index_size(chunks)))
-    return replace(record, index=bytes_digest(stored))
+        ends = [offset + length for offset, length in index_places(stored)]
+        checksums = [os.pread(file.fileno(), CHECKSUM_BYTES, end - CHECKSUM_BYTES) for end in ends if end > 0]
+    return replace(record, index=bytes_digest(stored), chunks=b"".join(checksums).hex())

@@ -1,7 +1,8 @@
 """Files of an episode as its seal lists them: bytes that are not those that were sealed are never returned.
 
 Of a shard (a file of compressed chunks with an index of their places at its end, Zarr's codec `sharding_indexed`)
-single chunks are read: the index is compared with the digest in the seal, and a chunk with the checksum at its end.
+single chunks are read: the index is compared with the digest in the seal, and a chunk with the checksum at its end and
+with that in the seal.
 """
 
 from __future__ import annotations
@@ -98,7 +99,12 @@ class SealedFiles:
             stored = self.source.part(file, max(0, record.size - size), size + 1)
         if bytes_digest(stored) != record.index:
             raise CorruptEpisode(f"{_differs(file)}: its index was changed, or it has another size", file)
-        return SealedShard(self.source, file, index_places(stored))
+        places = index_places(stored)
+        checksums = np.frombuffer(bytes.fromhex(record.chunks), "<u4").tolist()
+        if len(checksums) != sum(length >= 0 for _, length in places):
+            raise CorruptEpisode(f"{_differs(file)}, which knows {len(checksums)} of {len(places)} chunks", file)
+        following = iter(checksums)
+        return SealedShard(self.source, file, places, [next(following) if n >= 0 else 0 for _, n in places])
 
     def problems(self) -> dict[str, str]:
         """What is wrong, by file: it is missing, or has another size than in the seal. Reads none of them."""
@@ -125,36 +131,54 @@ class SealedFiles:
 
 @dataclass(frozen=True)
 class SealedShard:
-    """One shard's file, whose index agrees with the seal. places: offset and length of each chunk."""
+    """One shard's file, whose index agrees with the seal.
+
+    places: offset and length of each chunk. checksums: those of the chunks in the seal.
+    """
 
     source: ByteSource
     file: str
     places: Sequence[tuple[int, int]]
+    checksums: Sequence[int]
 
-    @property
-    def longest(self) -> int:
-        """Bytes of the longest chunk, with its checksum."""
-        return max((length for _, length in self.places), default=0)
+    def size(self, numbers: range) -> int:
+        """Bytes of some chunks, with their checksums."""
+        return sum(length for _, length in self.places[numbers.start : numbers.stop])
 
-    def chunk(self, number: int, memory: Memory | None = None) -> Memory:
-        """The encoded bytes of one chunk, without the checksum that follows them in the file.
+    def chunks(self, numbers: range, memory: Memory | None = None) -> Iterator[Memory]:
+        """The encoded bytes of chunks with neighbouring numbers, without the checksum that follows each in the file.
 
-        memory: as much as the `longest` chunk takes, for the result; new memory without. To be given new memory for
-        half a megabyte takes longer than to read it from the system's cache.
+        Chunks that follow each other in the file are read at once: on a network each reading is a request.
+
+        memory: as much as they take, for the results; new memory without. To be given new memory for half a megabyte
+        takes longer than to read it from the system's cache.
 
         Raises:
-            CorruptEpisode: the chunk is missing, or its checksum is not that of its bytes.
+            CorruptEpisode: a chunk is missing, or is not the one that was sealed.
         """
-        offset, length = self.places[number]
-        if length < 0:
-            raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing", self.file)
-        with _reading(self.file):
-            stored = np.empty(length, np.uint8) if memory is None else memory[:length]
-            count = self.source.read_into(stored, self.file, offset)
-        if count != length:
-            raise CorruptEpisode(f"its {self.file} ends in chunk {number}", self.file)
+        while numbers:
+            offset, length = self.places[numbers[0]]
+            ends = [offset + length]
+            for number in numbers[1:]:
+                begins, length = self.places[number]
+                if begins != ends[-1] or length < 0:
+                    break
+                ends.append(begins + length)
+            if self.places[numbers[0]][1] < 0:
+                raise CorruptEpisode(f"its {self.file} lacks chunk {numbers[0]}: it is missing", self.file)
+            with _reading(self.file):
+                size = ends[-1] - offset
+                stored = np.empty(size, np.uint8) if memory is None else memory[:size]
+                count = self.source.read_into(stored, self.file, offset)
+            if count != size:
+                raise CorruptEpisode(f"its {self.file} ends in chunk {numbers[0]}, or in one behind it", self.file)
+            for number, begin, end in zip(numbers, [offset, *ends], ends, strict=False):
+                yield self._checked(number, stored[begin - offset : end - offset])
+            numbers = numbers[len(ends) :]
+
+    def _checked(self, number: int, stored: Memory) -> Memory:
         chunk, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:].tobytes()
-        if crc32c(chunk) != int.from_bytes(checksum, "little"):
+        if not crc32c(chunk) == int.from_bytes(checksum, "little") == self.checksums[number]:
             raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit", self.file)
         return chunk
 

@@ -29,9 +29,9 @@ NAME.zarr/                            attributes: `RootAttributes`
 from __future__ import annotations
 
 import re
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from msgspec import field
+from msgspec import Meta, field
 from msgspec.structs import replace
 
 from vla_attention.schemas.effects import EffectsRecorded, EpisodeEffects
@@ -417,12 +417,14 @@ def is_episode_name(name: str) -> bool:
 class FileRecord(Document, frozen=True):
     """Size in bytes and sha256 of a file of an episode.
 
-    Of a shard, from which single chunks are read, `index` is the sha256 of the index at its end, with its checksum.
+    Of a shard, from which single chunks are read, `index` is the sha256 of the index at its end, with its checksum, and
+    `chunks` the checksums (crc32c) of its chunks, eight digits each: two episodes may have equal indices.
     """
 
     size: int
     sha256: str
     index: str = ""
+    chunks: Annotated[str, Meta(pattern="^([0-9a-f]{8})*$")] = ""
 
 
 class EpisodeSeal(Document, frozen=True):

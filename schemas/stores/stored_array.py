@@ -1,7 +1,7 @@
 """An array of an episode: its chunks are compared with their checksums, decoded, and put together.
 
 A chunk is read alone where the array's file is a shard of them. zarr-python is not needed: passing chunks through its
-event loop takes as long as decoding them.
+event loop takes as long as decoding them. Probabilities that are stored as float16 are read as float32.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
+from vla_attention.schemas.precision import from_half, in_range
 from vla_attention.schemas.stores.array_metadata import ArrayMetadata
 from vla_attention.schemas.stores.byte_source import Memory
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES
@@ -53,13 +54,30 @@ class StoredArray:
         Raises:
             CorruptEpisode: a chunk is missing, is not the one that was sealed, or decodes to another size.
         """
+        return self.values_of(self.read_stored(first, stop))
+
+    def values_of(self, stored: NDArray[Any], into: NDArray[np.float32] | None = None) -> NDArray[Any]:
+        """The numbers that stored ones stand for: probabilities, where they are float16. into: memory for these.
+
+        Raises:
+            CorruptEpisode: some stand for none.
+        """
+        if not self.metadata.is_half:
+            return stored
+        if not in_range(stored):
+            raise CorruptEpisode("it has missing values: a chunk is lost, or holds what is no probability", self._file)
+        return from_half(stored, into)
+
+    def read_stored(self, first: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """As `read`; probabilities in float16 as they are stored."""
         shape, chunk, grid = self.metadata.shape, self.metadata.chunk_shape, self.metadata.grid
         stop = shape[0] if stop is None else stop
         values = np.empty((stop - first, *shape[1:]), self.metadata.dtype)
         decoded = np.empty(chunk, self.metadata.dtype)
         blocks = range(first // chunk[0], -(-stop // chunk[0]) if values.size else 0)
-        for number, place in enumerate(product(blocks, *map(range, grid[1:])), blocks.start * math.prod(grid[1:])):
-            self._decode(number, decoded)
+        numbers = range(blocks.start * math.prod(grid[1:]), blocks.stop * math.prod(grid[1:]))
+        for place, (number, frame) in zip(product(blocks, *map(range, grid[1:])), self._frames(numbers), strict=False):
+            self._decode(number, frame, decoded)
             # Where the chunk begins among the wanted values: before them, if only its end is wanted.
             begins = [i * extent for i, extent in zip(place, chunk, strict=True)]
             begins[0] -= first
@@ -70,37 +88,64 @@ class StoredArray:
             part[...] = decoded[tuple(taken)]
         return values
 
-    def layers(self, places: Iterable[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
-        """Layers and denoise steps (positions) of an array (replan, layer, denoise, ...), one after the other.
+    def layers(self, places: Iterable[tuple[int, int]], keys: range | None = None) -> Iterator[NDArray[np.float32]]:
+        """Layers and denoise steps (positions) of an array (replan, layer, denoise, ..., key), one after the other.
 
-        Each is (replan, ...), and gone when the next one is asked for: all are decoded into the same memory, which
+        Each is (replan, ..., key), and gone when the next one is asked for: all are decoded into the same memory, which
         stays in the processor's cache.
+
+        keys: those that are read, which are whole chunks (`ArrayMetadata.whole_chunks`); all unless given.
 
         Raises:
             CorruptEpisode: as `read`, or a chunk holds something else than replans of one layer and denoise step.
         """
         shape, (block, *rest) = self.metadata.shape, self.metadata.chunk_shape
-        if len(shape) < 4 or rest != [1, 1, *shape[3:]]:
+        if len(shape) < 4 or rest[:-1] != [1, 1, *shape[3:-1]]:
             raise CorruptEpisode(f"its chunks are {self.metadata.chunk_shape}; expected replans of a layer and step")
-        blocks = self.metadata.grid[0]
-        memory = np.empty((blocks * block, *shape[3:]), self.metadata.dtype)
-        stored = None if self._shard is None else np.empty(self._shard.longest, np.uint8)
+        keys, of_key = range(shape[-1]) if keys is None else keys, rest[-1]
+        of_keys = range(keys.start // of_key, -(-keys.stop // of_key))
+        blocks, along_keys = self.metadata.grid[0], self.metadata.grid[-1]
+        values = np.empty((blocks * block, *shape[3:-1], len(keys)), self.metadata.read_dtype)
+        # A chunk that is all there is of some replans is decoded where it belongs.
+        in_place = not self.metadata.is_half and len(of_keys) == 1 and len(keys) == of_key
+        decoded = None if in_place else np.empty((block, *shape[3:-1], of_key), self.metadata.dtype)
+        memory = np.empty(0, np.uint8)
         for layer, denoise in places:
             if not (0 <= layer < shape[1] and 0 <= denoise < shape[2]):
                 raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {shape}")
             for i in range(blocks):
-                number = (i * shape[1] + layer) * shape[2] + denoise
-                self._decode(number, memory[i * block : (i + 1) * block], stored)
-            yield memory[: shape[0]]
+                first = ((i * shape[1] + layer) * shape[2] + denoise) * along_keys
+                numbers = range(first + of_keys.start, first + of_keys.stop)
+                if self._shard is not None and memory.size < self._shard.size(numbers):
+                    memory = np.empty(self._shard.size(numbers), np.uint8)
+                rows = values[i * block : (i + 1) * block]
+                for number, frame in self._frames(numbers, memory):
+                    if decoded is None:
+                        self._decode(number, frame, rows)
+                        continue
+                    self._decode(number, frame, decoded)
+                    begin = (number - first) * of_key
+                    into = rows[: shape[0] - i * block, ..., begin - keys.start : begin - keys.start + of_key]
+                    part = decoded[: len(into), ..., : into.shape[-1]]
+                    if self.metadata.is_half:
+                        self.values_of(part, into)
+                    else:
+                        into[...] = part
+            yield values[: shape[0]]
 
-    def _decode(self, number: int, values: NDArray[Any], stored: Memory | None = None) -> None:
-        """Decode a chunk into memory of its size. stored: memory for its encoded bytes."""
+    def _frames(self, numbers: range, memory: Memory | None = None) -> Iterator[tuple[int, memoryview]]:
+        """Numbers and encoded bytes of neighbouring chunks. memory: for these bytes."""
+        if self._shard is not None:
+            for number, chunk in zip(numbers, self._shard.chunks(numbers, memory), strict=True):
+                yield number, chunk.data
+        elif numbers:
+            yield 0, memoryview(self.files.whole(self._file))[:-CHECKSUM_BYTES]
+
+    def _decode(self, number: int, frame: memoryview, values: NDArray[Any]) -> None:
+        """Decode a chunk into memory of its size."""
         from numcodecs import blosc
 
-        if self._shard is None:
-            frame, what = memoryview(self.files.whole(self._file))[:-CHECKSUM_BYTES], "it"
-        else:
-            frame, what = self._shard.chunk(number, stored).data, f"chunk {number} of it"
+        what = "it" if self._shard is None else f"chunk {number} of it"
         # Blosc leaves what a shorter chunk does not fill as it was. Its header has the decoded size.
         size = int.from_bytes(frame[4:8], "little")
         if size != values.nbytes:

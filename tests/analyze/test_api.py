@@ -17,6 +17,7 @@ import vla_attention as va
 import vla_attention.analyze.api
 import vla_attention.analyze.measures.question_settings
 from tests.kit.planted_effects import planted_effects
+from tests.kit.raw_rows import probabilities
 from tests.kit.site_stores import write_site_store
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import small_layout
@@ -108,7 +109,7 @@ def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):
     span = small_layout().span("base_0_rgb")
     names = [f"task001_episode00{i}" for i in range(2)]
     group = zarr.open_group(store, mode="r")["episodes"]
-    rows = np.concatenate([group[name]["joint/rows"][:].mean(axis=4) for name in names])
+    rows = np.concatenate([probabilities(group[name]["joint/rows"]).mean(axis=4) for name in names])
     expected = rows[..., span.start : span.stop].sum(axis=-1).ravel()
     found = masses.filter(group="base_0_rgb")
     np.testing.assert_allclose(found["mass"].to_numpy(), expected, rtol=mass_error_bound(10) + 1e-6)

@@ -17,6 +17,7 @@ import vla_attention as va
 from tests.capture.torch_policies.test_session_knockouts import act_recorded
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, small_layout
 from tests.kit.small_torch_policy import given as policy_inputs
 from tests.kit.stores import StoreSpec, write_store
@@ -173,9 +174,8 @@ def made(request, tmp_path_factory):
 
 def raw(path) -> np.ndarray:
     """Rows of the first episode, mean over layers, steps, heads and queries: (replan, key)."""
-    return np.asarray(zarr.open_group(path / "episodes/task000_episode000", mode="r")["joint/rows"], np.float64).mean(
-        axis=(1, 2, 3, 4)
-    )
+    rows = probabilities(zarr.open_group(path / "episodes/task000_episode000", mode="r")["joint/rows"])
+    return rows.astype(np.float64).mean(axis=(1, 2, 3, 4))
 
 
 def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):

@@ -13,6 +13,7 @@ import zarr
 
 import vla_attention as va
 from tests.end_to_end.written_tables import written_steps
+from tests.kit.raw_rows import probabilities
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 
@@ -92,7 +93,9 @@ def test_results_file_has_the_published_structure(captured_store, tmp_path):
 def test_a_block_named_both_ways_is_stored_once_and_reported_twice(run_capture, tmp_path):
     """As in the published example, whose layers 8 and 26 are one block of a model with 18."""
     run_capture("--task-id", 0, "--num-episodes", 1, "--layers", 2, 0, 5, "--output-dir", tmp_path)
-    rows = zarr.open_group(tmp_path / "robosuite.zarr/episodes/task000_episode000", mode="r")["joint/rows"]
+    rows = probabilities(
+        zarr.open_group(tmp_path / "robosuite.zarr/episodes/task000_episode000", mode="r")["joint/rows"]
+    )
     assert rows.shape[1] == 2
     (episode,) = json.loads((tmp_path / "attention_ratio_results_robosuite.json").read_text())
     assert set(episode["summary"]) == {"layer_0", "layer_2", "layer_5", "layers_avg"}
@@ -130,7 +133,7 @@ def test_masses_equal_a_computation_by_hand_from_the_raw_arrays(captured_store, 
     va.open(captured_store).analyze(groups=groups, per_head=True).save(tmp_path, pictures=False)
     steps = written_steps(tmp_path).filter(task_id=1, episode_index=1)
     raw = zarr.open_group(captured_store / "episodes/task001_episode001", mode="r")
-    rows = raw["joint/rows"][:].astype(np.float64)[..., 0, :]
+    rows = probabilities(raw["joint/rows"]).astype(np.float64)[..., 0, :]
     assert len(steps) == np.prod(rows.shape[:-1])
     # 2 x 2 patches, row-major: the left column is keys 0 and 2 of the first camera.
     np.testing.assert_allclose(
@@ -173,9 +176,9 @@ def test_recording_does_not_change_what_the_robot_does(captured_store, run_captu
             for store in (little, captured_store)
         )
         assert np.array_equal(few, many)
-    one = zarr.open_group(little / "episodes/task000_episode000", mode="r")["joint/rows"][:]
+    one = probabilities(zarr.open_group(little / "episodes/task000_episode000", mode="r")["joint/rows"])
     assert one.shape[1:4] == (1, 1, 1)
-    full = zarr.open_group(captured_store / "episodes/task000_episode000", mode="r")["joint/rows"]
+    full = probabilities(zarr.open_group(captured_store / "episodes/task000_episode000", mode="r")["joint/rows"])
     assert np.array_equal(one[:, 0, 0, 0], full[:, 1, 1, 3])
 
 

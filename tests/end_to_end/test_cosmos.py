@@ -9,6 +9,7 @@ import pytest
 import zarr
 
 from tests.end_to_end.written_tables import written_steps
+from tests.kit.raw_rows import probabilities
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
@@ -103,7 +104,7 @@ def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path, monkeypatch)
 def test_queries_can_be_pooled_by_action_step(tmp_path):
     store = tmp_path / "a.zarr"
     assert capture([*ONE_LAYER, "--queries", "steps", "--output", str(store)]) == 0
-    rows = zarr.open_group(store / "episodes/task000_episode000", mode="r")["self/rows"]
+    rows = probabilities(zarr.open_group(store / "episodes/task000_episode000", mode="r")["self/rows"])
     assert rows.shape[4] == 16 * 7
     assert analyze(["store", "verify", str(store)]) == 0
 

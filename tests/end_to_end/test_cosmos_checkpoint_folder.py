@@ -17,6 +17,7 @@ import zarr
 
 from tests.end_to_end.written_tables import written_steps
 from tests.kit.cosmos_checkpoint import write_dummy_folder
+from tests.kit.raw_rows import probabilities
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.suites import find_suite, list_tasks
@@ -78,7 +79,8 @@ def libero_store(libero_run: Path) -> Path:
 
 def rows_of(store: Path, site: str) -> np.ndarray:
     """(replan, layer, denoise, head, query, key) float64."""
-    return zarr.open_group(store / "episodes/task000_episode000", mode="r")[f"{site}/rows"][:].astype(np.float64)
+    group = zarr.open_group(store / "episodes/task000_episode000", mode="r")
+    return probabilities(group[f"{site}/rows"]).astype(np.float64)
 
 
 @pytest.mark.thorough

@@ -26,6 +26,17 @@ FEW = settings(
 )
 
 
+def probabilities(array: zarr.Array) -> np.ndarray:
+    """What an array of rows holds, float32: its numbers times its `scale_factor`, where it has one."""
+    return array[:].astype(np.float32) * np.float32(array.attrs.get("scale_factor", 1))
+
+
+def put_probabilities(array: zarr.Array, rows: np.ndarray) -> None:
+    """Write rows into an array that is there, with another program; nothing is rounded or checked."""
+    with np.errstate(over="ignore"):
+        array[...] = (rows / np.float32(array.attrs.get("scale_factor", 1))).astype(array.dtype)
+
+
 @dataclass(frozen=True)
 class RawEpisode:
     """An episode's rows (replan, layer, denoise, head, key) float64, mean over queries, one layer for each label.
@@ -51,7 +62,7 @@ def raw_episodes(path: Path, spec: StoreSpec) -> list[RawEpisode]:
     found = []
     for task, episode in spec.names:
         site = zarr.open_group(path / f"episodes/task{task:03d}_episode{episode:03d}", mode="r")["joint"]
-        rows = site["rows"][:].astype(np.float64).mean(axis=4)[:, layers]
+        rows = probabilities(site["rows"]).astype(np.float64).mean(axis=4)[:, layers]
         found.append(RawEpisode((task, episode), rows, valid_keys(site["key_role"][:])))
     return found
 

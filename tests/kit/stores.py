@@ -37,7 +37,7 @@ from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, RerunSource
 from vla_attention.schemas.layout import Role, SiteLayout, picture_size
-from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.precision import as_read
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.digest import with_digest
 from vla_attention.schemas.stores.reader import open_store
@@ -399,7 +399,7 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
     members = segment_members(spec.layout, roles, segments_of(spec.layout, roles))
     prompts = list(dict.fromkeys(record.prompt for record in records))
     arrays: dict[str, NDArray[Any]] = {
-        "joint/rows": round_mantissa(rows, spec.mantissa_bits),
+        "joint/rows": as_read(rows, spec.mantissa_bits),
         "joint/row_sum": np.stack([record.rows["joint"].row_sum for record in records]),
         "joint/atoms": np.stack(
             [
@@ -407,7 +407,7 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
                 for row, of in zip(rows, members, strict=True)
             ]
         ),
-        "joint/uniform": _uniform_once([record.rows["joint"].uniform for record in records], roles),
+        **_uniform_once([record.rows["joint"].uniform for record in records], roles),
         "joint/key_role": roles,
         "env_step": np.array([record.env_step for record in records], dtype=np.int32),
         "noise_seed": np.array([record.noise_seed for record in records], dtype=np.int64),
@@ -430,18 +430,25 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
     return arrays
 
 
-def _uniform_once(uniform: Sequence[NDArray[np.float32] | None], roles: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """What uniform attention gives at each replan, once along every axis (but keys) along which it is the same."""
+def _uniform_once(
+    uniform: Sequence[NDArray[np.float32] | None], roles: NDArray[np.uint8]
+) -> dict[str, NDArray[np.float32]]:
+    """What uniform attention gives at each replan, once along every axis (but keys) along which it is the same.
+
+    Nothing where the roles say it.
+    """
     given = [
         uniform_of_roles(role)[None, None, None, None] if one is None else one
         for one, role in zip(uniform, roles, strict=True)
     ]
     cells = np.broadcast_shapes(*(one.shape for one in given))
     whole = np.stack([np.broadcast_to(one, cells) for one in given]).astype(np.float32)
+    if (whole == uniform_of_roles(roles)[:, None, None, None, None].astype(np.float32)).all():
+        return {}
     for axis in range(whole.ndim - 1):
         first = whole.take([0], axis=axis)
         whole = first if (whole == first).all() else whole
-    return whole
+    return {"joint/uniform": whole}
 
 
 def contribution_vectors(spec: StoreSpec, tokens: EpisodeTokens, seed: list[int], replan: int) -> NDArray[np.float64]:

@@ -6,9 +6,9 @@ import json
 import shutil
 
 import pytest
+from scripts.convert_effects import convert
 
 import vla_attention as va
-from scripts.convert_effects import convert
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import read_seal, seal_episode
 from vla_attention.schemas.stores.store_format import StoreError

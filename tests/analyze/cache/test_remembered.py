@@ -46,7 +46,7 @@ def originals(tmp_path_factory) -> tuple[Path, Path]:
     """Two stores of other seeds, with equal shapes; rows are in three blocks."""
     folder = tmp_path_factory.mktemp("originals")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(site_writer, "replans_per_block", lambda size, count=None: 8 // gcd(8, size // 4))
+        patch.setattr(site_writer, "replans_per_block", lambda size, numbers, count=None: 8 // gcd(8, numbers))
         return write_store(folder / "a.zarr", spec=SPEC), write_store(folder / "b.zarr", spec=SPEC, seed=3)
 
 

@@ -22,6 +22,7 @@ import vla_attention as va
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import OBJECTS, random_rows
 from vla_attention.analyze.__main__ import main
@@ -80,7 +81,7 @@ def raw_episode(path: Path, name: str) -> tuple[np.ndarray, dict[str, np.ndarray
     coverage = {
         camera: episode[f"objects/{camera}"][:].astype(float) for camera in spans if f"objects/{camera}" in episode
     }
-    return episode["joint/rows"][:].astype(np.float64).mean(axis=4), coverage, spans
+    return probabilities(episode["joint/rows"]).astype(np.float64).mean(axis=4), coverage, spans
 
 
 def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):

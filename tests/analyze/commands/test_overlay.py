@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 import tests.kit.stores as kit
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.overlay import overlay
 from vla_attention.analyze.core.camera_maps import choose_episodes
@@ -115,7 +116,7 @@ def test_the_tables_have_the_raw_rows_numbers(made: Path, tmp_path: Path) -> Non
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.png", f"{name}.pdf", *tables}
     table, shown = (pl.read_parquet(tmp_path / f"overlay{end}.parquet") for end in ("_patches", ""))
     group = zarr.open_group(made / "episodes/task001_episode001", mode="r")
-    rows = np.asarray(group["joint/rows"])[:, 1, 1, 1, 0].astype(np.float64)  # layer 2, last denoise step, head 1
+    rows = probabilities(group["joint/rows"])[:, 1, 1, 1, 0].astype(np.float64)  # layer 2, last denoise step, head 1
     roles = np.asarray(group["joint/key_role"])
     valid = ~np.isin(roles, [int(Role.MASKED_IMAGE), int(Role.PADDING), int(Role.NULL)])
     image = roles == int(Role.IMAGE)

@@ -13,6 +13,7 @@ import zarr
 from tests.kit.archives import example_store
 from tests.kit.bowl_scene import write_bowl_store
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from tests.kit.stores import write_store
 from tests.kit.tokens import random_rows
 from vla_attention.analyze.__main__ import main
@@ -44,7 +45,7 @@ def raw_measures(path: Path, name: str, layer: int) -> dict[tuple[str, int], tup
     anew.
     """
     episode = zarr.open_group(path / "episodes" / name, mode="r")
-    rows = episode["joint/rows"][:].astype(np.float64).mean(axis=(2, 3, 4))  # (replan, layer, key)
+    rows = probabilities(episode["joint/rows"]).astype(np.float64).mean(axis=(2, 3, 4))  # (replan, layer, key)
     roles, index = episode["joint/key_role"][:], episode.attrs["prompt_index"]
     collected: dict[tuple[str, int], list[tuple[float, float, float, float]]] = {}
     for replan, row in enumerate(rows[:, layer]):

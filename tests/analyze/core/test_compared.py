@@ -11,6 +11,7 @@ import pytest
 import zarr
 
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.core.compared import Compared, RunValues
 from vla_attention.analyze.core.runs import Run
@@ -27,7 +28,8 @@ def test_a_head_has_its_part_of_the_attention_of_the_groups(tmp_path):
     assert values.height == 2 * 2 * 2
     for row in values.iter_rows(named=True):
         group = zarr.open_group(path, mode="r")[f"episodes/task000_episode{row['episode_index']:03d}"]
-        rows, roles = group["joint/rows"][:, (0, 2).index(row["layer"]), :, row["head"], 0], group["joint/key_role"][:]
+        rows, roles = probabilities(group["joint/rows"]), group["joint/key_role"][:]
+        rows = rows[:, (0, 2).index(row["layer"]), :, row["head"], 0]
         parts = []
         for replan, row_of_keys in enumerate(rows.mean(axis=1)):
             seen, told = (row_of_keys[roles[replan] == role].sum() for role in (Role.IMAGE, Role.INSTRUCTION))

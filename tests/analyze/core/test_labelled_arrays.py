@@ -9,6 +9,7 @@ import pytest
 import zarr
 
 import vla_attention as va
+from tests.kit.raw_rows import probabilities
 from tests.kit.stores import StoreSpec, num_steps, write_store
 from vla_attention.schemas.layout import Role
 
@@ -32,7 +33,7 @@ def store(tmp_path_factory) -> Path:
 def raw(store: Path, task: int, episode: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows (replan, layer, denoise, head, key), what uniform attention gives (replan, key), and roles."""
     group = zarr.open_group(store, mode="r")[f"episodes/task{task:03d}_episode{episode:03d}"]
-    rows, roles = group["joint/rows"][:].astype(float)[..., 0, :], group["joint/key_role"][:]
+    rows, roles = probabilities(group["joint/rows"]).astype(float)[..., 0, :], group["joint/key_role"][:]
     seen = ~np.isin(roles, [Role.PADDING, Role.MASKED_IMAGE])
     return rows, seen / seen.sum(axis=1, keepdims=True), roles
 

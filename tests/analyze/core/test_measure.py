@@ -16,6 +16,7 @@ from polars.testing import assert_frame_equal
 from tests.kit.examples import examples
 from tests.kit.made_up_steps import steps_of
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from tests.kit.stores import StoreSpec, root_attributes, write_store
 from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.commands.analyze import analyze
@@ -57,7 +58,7 @@ def test_masses_equal_sums_over_raw_rows_and_add_up_to_the_row_sums(data):
         )
         table = table_of(path, grouping, per_head)
         raw = zarr.open_group(path / "episodes/task000_episode000", mode="r")["joint"]
-        rows, sums = raw["rows"][:].astype(np.float64), raw["row_sum"][:].astype(np.float64)
+        rows, sums = probabilities(raw["rows"]).astype(np.float64), raw["row_sum"][:].astype(np.float64)
     rows, sums = rows.mean(axis=4), sums.mean(axis=4)
     if not per_head:
         rows, sums = rows.mean(axis=3, keepdims=True), sums.mean(axis=3, keepdims=True)

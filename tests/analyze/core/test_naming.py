@@ -24,6 +24,7 @@ from benchmarks.null_objects import (
 )
 from tests.kit.made_up_behaviour import COLOURS
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from vla_attention.analyze.core.naming import ALL_NAMED, by_kind, differences, naming, told_things
 from vla_attention.analyze.core.object_shares import with_coverage
 from vla_attention.schemas.episode_steps import EpisodeSteps
@@ -46,7 +47,7 @@ def first_maps(path: Path) -> dict[tuple[int, int], tuple]:
     spans = [span for span in root.attrs["sites"][0]["spans"] if span["camera"]]
     for _, episode in root["episodes"].groups():
         about = dict(episode.attrs)
-        row = episode["joint/rows"][0].astype(np.float64).mean(axis=(0, 1, 2, 3))
+        row = probabilities(episode["joint/rows"])[0].astype(np.float64).mean(axis=(0, 1, 2, 3))
         maps = {span["camera"]: row[span["start"] : span["stop"]] for span in spans}
         areas = {camera: episode[f"objects/{camera}"][0].astype(np.float64) for camera in maps}
         whole = sum(one.sum() for one in maps.values())

@@ -11,6 +11,7 @@ import zarr
 
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
 from tests.kit.questions import question_about
+from tests.kit.raw_rows import probabilities
 from tests.kit.tokens import random_rows
 from vla_attention.analyze.core.object_maps import object_maps, over_place
 
@@ -48,7 +49,7 @@ def raw(store: Path, task: int, episode: int) -> tuple[dict[str, np.ndarray], di
     """Of each camera rows (replan, layer, denoise, head, patch), and coverage (replan, patch, item)."""
     root = zarr.open_group(store, mode="r")
     group = root[f"episodes/task{task:03d}_episode{episode:03d}"]
-    rows = group["joint/rows"][:].astype(np.float64).mean(axis=4)
+    rows = probabilities(group["joint/rows"]).astype(np.float64).mean(axis=4)
     spans = {span["camera"]: span for span in root.attrs["sites"][0]["spans"] if span["camera"]}
     keys = {camera: slice(spans[camera]["start"], spans[camera]["stop"]) for camera in CAMERAS}
     return {c: rows[..., keys[c]] for c in CAMERAS}, {c: group[f"objects/{c}"][:].astype(float) for c in CAMERAS}

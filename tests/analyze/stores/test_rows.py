@@ -11,18 +11,19 @@ import polars as pl
 import pytest
 import zarr
 
+from tests.kit.raw_rows import probabilities, put_probabilities
 from tests.kit.stores import reseal, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import select
-from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.precision import as_read
 from vla_attention.schemas.stores.content_rules import add_up, row_sum_bound
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 
 def raw_rows(path: Path) -> np.ndarray:
-    return zarr.open_array(path / "episodes/task000_episode000/joint/rows", mode="r")[:]
+    return probabilities(zarr.open_array(path / "episodes/task000_episode000/joint/rows", mode="r"))
 
 
 @pytest.mark.parametrize("queries", ["mean", "all"])
@@ -65,9 +66,9 @@ def with_other_rows(path: Path, change: Callable[[np.ndarray], object], **fields
     write_store(path, tasks=(0,), episodes=2, replans=11, heads=(0, 1, 3), layers=(0, 2), **fields)
     folder = path / "episodes/task000_episode000"
     rows = zarr.open_array(folder / "joint/rows", mode="r+")
-    values = rows[:]
+    values = probabilities(rows)
     change(values)
-    rows[...] = values
+    put_probabilities(rows, values)
     reseal(folder)
     return path
 
@@ -84,7 +85,7 @@ def test_a_row_of_another_sum_is_refused_by_its_place(tmp_path, queries, per_hea
     with pytest.raises(CorruptEpisode) as caught:
         list(layer_rows(store.attributes, store.episodes[0], selection, "joint"))
     assert re.search(
-        r"task000_episode000 .*joint/rows .*0\.01 .*0\.0005, at replan 7, denoise step 0, layer 2, head 3"
+        r"task000_episode000 .*joint/rows .*0\.0(1|099) .*0\.0005, at replan 7, denoise step 0, layer 2, head 3"
         r"(, query 0, .* 3 of 99 .*)?\.$",
         str(caught.value),
     )
@@ -111,15 +112,22 @@ def test_commands_end_so_or_leave_the_episode_out(tmp_path, capsys):
     ]
 
 
-@pytest.mark.parametrize("value", [np.inf, 1e38, -0.5])
-def test_numbers_that_no_row_has_are_refused_without_a_warning(tmp_path, value):
+@pytest.mark.parametrize(
+    ("bits", "value", "said"),
+    [
+        *((23, value, r"replan 3, denoise step 9, layer 0, head 0") for value in (np.inf, 1e38, -0.5)),
+        *((10, value, "joint/rows .*no probability") for value in (np.inf, np.nan, -0.5, -(2.0**-39), 1.99)),
+        (10, 1.989, r"replan 3, denoise step 9, layer 0, head 0"),
+    ],
+)
+def test_numbers_that_no_row_has_are_refused_without_a_warning(tmp_path, bits, value, said):
     def change(values: np.ndarray) -> None:
         values[3, 0, 1, 0, 0, 4:] = value
 
-    store = open_store(with_other_rows(tmp_path / "a.zarr", change))
+    store = open_store(with_other_rows(tmp_path / "a.zarr", change, mantissa_bits=bits))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(CorruptEpisode, match=r"replan 3, denoise step 9, layer 0, head 0"):
+        with pytest.raises(CorruptEpisode, match=said):
             list(layer_rows(store.attributes, store.episodes[0], select(store.attributes), "joint"))
 
 
@@ -130,7 +138,7 @@ def test_what_is_quickly_held_to_add_up_does(bits, keys):
     rows = generator.random((200, keys)).astype(np.float32) ** 8
     rows /= rows.sum(axis=1, keepdims=True)
     sums = rows.sum(axis=1, dtype=np.float64).astype(np.float32)
-    rounded = round_mantissa(rows, bits)
+    rounded = as_read(rows, bits)
     assert add_up(rounded, sums, bits)
     bound = row_sum_bound(bits)
     for share, expected in ((0.98, True), (1.02, False)):

@@ -15,6 +15,7 @@ import vla_attention as va
 from tests.kit.lerobot_data_sets import H264, episodes_of_store, made_up_episodes, number_of, write_data_set
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.races import unlike
+from tests.kit.raw_rows import probabilities
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
 from tests.thorough.hostile_data_sets.run_cases import CASES
@@ -206,7 +207,7 @@ def test_the_border_beside_a_picture_that_is_fitted_in_is_no_picture(tmp_path):
         seen = stored[f"frames/{camera}"][:].any(axis=(0, 2, 3))
         np.testing.assert_array_equal(seen, [5 <= row < 23 for row in range(28)])
     groups = {row["group"]: row for row in va.open(store).analyze()["tasks_groups"].iter_rows(named=True)}
-    rows, roles = stored["joint/rows"][:].mean(axis=(1, 2, 3, 4)), stored["joint/key_role"][:]
+    rows, roles = probabilities(stored["joint/rows"]).mean(axis=(1, 2, 3, 4)), stored["joint/key_role"][:]
     whole = (rows * (roles == Role.IMAGE)).sum(axis=1).mean()
     for group, part in (("visual", 9 / 14), ("border", 5 / 14)):
         assert groups[group]["mass"] == pytest.approx(whole * part, rel=1e-4)

@@ -1,7 +1,7 @@
 """How many files and folders captured episodes have: clusters and hubs count them.
 
-Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 11
-files, 13 with contributions, as the sites here do.
+Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 9
+files, 11 with contributions, as the sites here do.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def check_few(store: Path, most: int = MOST_FILES) -> int:
         root = open_store(store).attributes
         pictures = sum("frames/" in name for name in episode.attributes.arrays)
         expected = estimate_disk(root.recording, root.sites, [0] * pictures, 1, 1).inodes_per_episode
-        assert len(folders) + found[-1] <= expected <= 1.6 * (len(folders) + found[-1])
+        assert len(folders) + found[-1] <= expected <= 1.7 * (len(folders) + found[-1])
         assert found[-1] == len(kinds) + len(episode.attributes.arrays)
     assert max(found) <= most
     return max(found)
@@ -62,7 +62,7 @@ def still_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pi_its_reruns_and_replays(tmp_path):
     store = tmp_path / "run.zarr"
     run("pi", *WHERE, *TINY, "--queries", "all", "--denoise", "all", "--contributions", "--output", store)
-    assert check_few(store, 36) == 36
+    assert check_few(store, 34) == 34
     run("rerun", store, "--knockout", "camera:base_0_rgb", "--output", tmp_path / "without.zarr")
     check_few(tmp_path / "without.zarr")
     data = write_data_set(tmp_path / "data", "v3.0", episodes_of_store(store, CAMERAS))

@@ -234,7 +234,7 @@ def test_a_list_that_lacks_episodes_is_named_where_the_server_shows_them(copied,
 def test_a_server_without_ranges_is_refused_with_a_sentence(server, copied, capsys):
     server.ranges = False
     assert "range" in " ".join(read_all(f"{server.url}/a.zarr", copied))
-    assert analyze([f"{server.url}/a.zarr", "--no-plots"]) == 2
+    assert analyze(["words", f"{server.url}/a.zarr", "--no-plots"]) == 2
     said = capsys.readouterr().err
     assert "range" in said
     assert said.count("\n") == 1
