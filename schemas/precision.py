@@ -111,7 +111,8 @@ def _table() -> NDArray[np.float32]:
     """The probability of each of the 65,536 float16; numpy converts them without subnormal float32."""
     import numpy as np
 
-    return np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32) * np.float32(HALF_SCALE)
+    with np.errstate(invalid="ignore"):
+        return np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32) * np.float32(HALF_SCALE)
 
 
 def as_read(values: NDArray[np.float32], bits: int) -> NDArray[np.float32]:

@@ -30,7 +30,7 @@ from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import MissingDependency
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.precision import mass_error_bound
+from vla_attention.schemas.precision import key_error_bound, mass_error_bound
 from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
@@ -91,10 +91,12 @@ def rows_of_episodes(question: Question) -> Iterator[xarray.Dataset]:
         MissingDependency: xarray is not installed.
     """
     xr, selection = _xarray(), question.selection
+    bits = question.stores[0].attributes.recording.mantissa_bits
     about = {
         "long_name": "attention probability, mean over the stored queries",
         "units": "1",
-        "relative_error": mass_error_bound(question.stores[0].attributes.recording.mantissa_bits),
+        "relative_error": mass_error_bound(bits),
+        "absolute_error": key_error_bound(bits),
     }
     for item in question.selected:
         shape = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), len(selection.heads))

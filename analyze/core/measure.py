@@ -8,7 +8,8 @@ heads (and for "layers_avg" over layers), unless these axes are kept.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
@@ -31,10 +32,15 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.errors import Note, listing
 from vla_attention.schemas.groupings.resolve import counted_keys, once_if_unchanged
+from vla_attention.schemas.precision import key_error_bound
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 Array: TypeAlias = NDArray[np.float64]
+#: A note names the items whose mass may be changed by more than this part of it where tiny probabilities were rounded.
+_UNSURE = 0.01
 
 
 @dataclass(frozen=True)
@@ -129,11 +135,30 @@ def measure(
         "items", chosen, selection, question.site, each, arguments, digests, lambda i: (chosen[i].fresh(), described[i])
     )
 
+    unsure: dict[str, None] = {}
+
+    def kept() -> Iterator[dict[str, NDArray[Any]]]:
+        for i, content in enumerate(arrays):
+            found = content.pop("unsure")
+            if found.any():
+                labels = described[i].labels
+                names = next((labels[name] for name in ("item", "group") if name in labels), [*labels.values()][-1])
+                unsure.update(dict.fromkeys(names.filter(pl.Series(found)).drop_nulls().to_list()))
+            yield content
+
     def made(i: int, content: dict[str, NDArray[Any]]) -> Measured:
         about = described[i]
         return Measured(chosen[i], selection, about.labels, about.absent, **content)
 
-    return OnDisk(arrays, made)
+    measured = OnDisk(kept(), made)
+    if unsure:
+        warnings.warn(
+            f"Some policy calls give {visible(listing(unsure, 4))} so little attention that rounding at capture may "
+            f"have changed it by more than {_UNSURE:.0%}; a capture with --precision exact keeps it.",
+            Note,
+            stacklevel=2,
+        )
+    return measured
 
 
 @dataclass(frozen=True)
@@ -174,18 +199,23 @@ def _measured(
     weights = items_of(item).with_totals(item) if about.weights is None else about.weights
     replans, steps = item.tokens.num_replans, len(selection.denoise)
     heads = len(selection.heads) if selection.per_head else 1
-    of_segments = _segment_weights(item, weights, site)
+    of_segments, rounded = _segment_weights(item, weights, site), 0.0
     if of_segments is not None:
         atoms = _selected_cells(item.episode.read(f"{site}/atoms"), selection).mean(axis=-2)
         mass = masses(atoms if selection.per_head else atoms.mean(axis=3, keepdims=True), of_segments)
         mass = mass if denoise else mass.mean(axis=2, keepdims=True)
     else:
+        rounded = key_error_bound(item.store.attributes.recording.mantissa_bits)
         mass = np.zeros((replans, len(selection.layers), steps if denoise else 1, heads, weights.shape[2]))
         for part in layer_rows(item.store.attributes, item.episode, selection, site):
             found = masses(part.rows, weights)
             mass[:, part.layer, part.denoise if denoise else 0] += found if denoise else found / steps
     uniform = uniform_masses(uniform_keys(item, selection), weights)
     uniform = uniform if denoise else uniform.mean(axis=2, keepdims=True)
+    keys = counted_keys(weights, item.tokens.existing)[:, :-2]
+    far = rounded * keys[:, None, None, None] > _UNSURE * mass[..., :-2]
+    # Keys that the run has cut off have no attention, to the last bit.
+    far &= (mass[..., :-2] > 0) if item.store.attributes.interventions.keys else (uniform[..., :-2] > 0)
     # As they were before storage rounded the rows.
     row_sum = _selected_cells(item.episode.read(f"{site}/row_sum"), selection).mean(axis=-1)
     row_sum = (row_sum if selection.per_head else row_sum.mean(axis=-1, keepdims=True)).astype(np.float64)
@@ -193,7 +223,8 @@ def _measured(
         "mass": mass[..., :-2],
         "whole": mass[..., -2] if about.whole is None else mass[..., : about.whole].sum(axis=-1),
         "valid": mass[..., -1],
-        "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
+        "keys": keys,
+        "unsure": far.any(axis=(0, 1, 2, 3)),
         "uniform": uniform[..., :-2],
         "uniform_valid": uniform[..., -1],
         "row_sum": row_sum if denoise else row_sum.mean(axis=2, keepdims=True),

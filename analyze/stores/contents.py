@@ -16,7 +16,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.layers import block_of_labels
 from vla_attention.schemas.layout import Role, Span
-from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, is_half, key_error_bound, mass_error_bound
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import Protocol, RootAttributes
@@ -117,10 +117,12 @@ def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> It
     yield "denoise", f"steps {listing(recording.denoise_steps, 40)} of {policy.num_denoise_steps}"
     yield "heads", listing(recording.heads, 40)
     yield "queries", f"{recording.queries} over {recording.num_action_queries} action queries"
-    exact = recording.mantissa_bits == FLOAT32_MANTISSA_BITS
-    error = "exact" if exact else f"masses within {mass_error_bound(recording.mantissa_bits):.1e} (relative)"
+    bits = recording.mantissa_bits
+    tiny = f" and {key_error_bound(bits):.1e} for each token" if is_half(bits) else ""
+    exact = bits == FLOAT32_MANTISSA_BITS
+    error = "exact" if exact else f"masses within {mass_error_bound(bits):.1e} (relative){tiny}"
     yield "computed in", str(policy.config.get("dtype", "not stated"))
-    yield "precision", f"{recording.mantissa_bits} mantissa bits: {error}"
+    yield "precision", f"{bits} mantissa bits: {error}"
     for site in root.sites:
         note = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
         yield f"site {site.name}", f"{site.num_keys} keys{note}; span, keys, roles (their number at the first replan)"

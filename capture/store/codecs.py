@@ -24,11 +24,11 @@ from vla_attention.schemas.precision import HALF_MANTISSA_BITS, HALF_SCALE, is_h
 #: Decoded size of a chunk, about: large enough for the codec, small enough to read one layer quickly.
 TARGET_CHUNK_BYTES = 2 << 20
 
+#: Fewest keys of a chunk that has not all of them.
+FEWEST_KEYS = 128
+
 #: Chunks are named `c.0.0`: with the separator `/`, every axis would be a folder of its own.
 CHUNK_KEYS: dict[str, Any] = {"name": "default", "configuration": {"separator": "."}}
-
-#: Fewer keys are no chunk of their own.
-FEWEST_KEYS = 128
 
 #: Fill values, which zarr gives for a missing chunk, by kind of number. No stored float has this value. A stored byte
 #: may, so readers of pictures must check that the chunk's file exists.

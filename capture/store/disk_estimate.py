@@ -1,7 +1,7 @@
 """The disk space and inodes of a run, printed before it: an upper bound.
 
 What rows, pictures and coverage compress to depends on the policy and the scene, so no formula says it: at 10 mantissa
-bits a number takes 1.4 to 2.1 bytes, a picture a third of its pixels or a tenth. The bound needs no policy call; a run
+bits a number takes 1.1 to 2 bytes, a picture a third of its pixels or a tenth. The bound needs no policy call; a run
 says after its first episode what that took (`engine/progress.py`).
 """
 
@@ -11,19 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vla_attention.capture.store.codecs import FEWEST_KEYS
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.layout import SiteLayout
-from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, HALF_MANTISSA_BITS, is_half
 from vla_attention.schemas.stores.store_format import Recording
 from vla_attention.schemas.stores.store_place import Room, room_at
 
-#: Exponent bits that differ between probabilities: a float32 in [0, 2) has 0 as its sign and highest exponent bit.
-_EXPONENT_BITS = 7
+#: Exponent bits that differ between probabilities: a float32 in [0, 2) has 0 as its sign and highest exponent bit, a
+#: float16 of p x 2^15 has 0 as its sign.
+_EXPONENT_BITS, _HALF_EXPONENT_BITS = 7, 5
 #: Factor by which compression can enlarge numbers that it cannot make smaller.
 _INCOMPRESSIBLE = 1.01
-#: Header, checksum and place in the index of one chunk.
-_CHUNK_OVERHEAD = 40
+#: Header, checksum and place in the index of one chunk, and its checksum in the seal.
+_CHUNK_OVERHEAD = 48
 #: Most segments (keys of one span and one role) that a span has in an episode, where it is more than one.
 _SEGMENTS_OF_SPAN = {"text": 6, "latent": 2}
 #: One token of a prompt in the attributes, as JSON.
@@ -74,9 +76,12 @@ def bytes_per_number(mantissa_bits: int) -> float:
     """Largest number of stored bytes per recorded float32 at a precision.
 
     Bit shuffle puts side by side the bits that rounding cleared and those that are the same in all probabilities; there
-    they take no space. At worst the others do not compress at all. Rows of trained models take 10 to 25 % less.
+    they take no space. At worst the others do not compress at all. Rows of trained models take 5 to 25 % less.
     """
-    return _INCOMPRESSIBLE * (_EXPONENT_BITS + min(mantissa_bits, FLOAT32_MANTISSA_BITS)) / 8
+    if mantissa_bits == HALF_MANTISSA_BITS:  # shuffled by bytes
+        return _INCOMPRESSIBLE * 2
+    exponent = _HALF_EXPONENT_BITS if is_half(mantissa_bits) else _EXPONENT_BITS
+    return _INCOMPRESSIBLE * (exponent + min(mantissa_bits, FLOAT32_MANTISSA_BITS)) / 8
 
 
 def estimate_disk(
@@ -92,7 +97,8 @@ def estimate_disk(
         chunks = len(of_site.layers) * len(of_site.denoise_steps)
         rows_of_site = chunks * len(of_site.heads) * of_site.num_queries
         segments = sum(_SEGMENTS_OF_SPAN.get(span.kind, 1) for span in site.spans)
-        total += rows_of_site * site.num_keys * bytes_per_number(recording.mantissa_bits) + chunks * _CHUNK_OVERHEAD
+        total += rows_of_site * site.num_keys * bytes_per_number(recording.mantissa_bits)
+        total += chunks * _CHUNK_OVERHEAD * -(-site.num_keys // FEWEST_KEYS)
         total += rows_of_site * 4 * (segments + 1) * _INCOMPRESSIBLE + site.num_keys
         # What uniform attention gives is one row a replan where all queries see the same keys.
         total += 4 * site.num_keys * _INCOMPRESSIBLE + _CHUNK_OVERHEAD

@@ -9,7 +9,8 @@ so that attention that is uniform at each query gives every group with a key tha
 
     lift = (mass of the group / sum of its u) / (mass of the valid keys / sum of their u) = 1.
 
-A store holds u (`SITE/uniform`), because masks may differ between queries, layers, heads and denoise steps.
+A store holds u (`SITE/uniform`) unless the roles of the keys say it: masks may differ between queries, layers, heads
+and denoise steps.
 """
 
 from __future__ import annotations

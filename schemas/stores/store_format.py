@@ -6,10 +6,11 @@ Schema files, the example stores and the golden stores again.
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
     joint/                            attributes: the numbers of its recorded layers, denoise steps and heads
-    joint/rows                        (replan, layer, denoise, head, query, key) float32
+    joint/rows                        (replan, layer, denoise, head, query, key) float16 of p x 2^15, or float32
     joint/row_sum                     (replan, layer, denoise, head, query) float32
     joint/atoms                       (replan, layer, denoise, head, query, segment) float32
-    joint/uniform                     as `rows`, float32; an axis along which nothing changes has length 1
+    joint/uniform                     as `rows`, float32; an axis along which nothing changes has length 1; only where
+                                      the roles do not say it
     joint/key_role                    (replan, key) uint8
     state                             (replan, state_dim); only where it is known
     actions                           (replan, horizon, action_dim), as given to the environment; only where known

@@ -23,7 +23,7 @@ import polars as pl
 
 import vla_attention as va
 from tests.kit.site_stores import SiteStoreSpec, write_site_store
-from tests.kit.stores import StoreSpec, small_effects, small_steps, write_store
+from tests.kit.stores import StoreSpec, every_key_seen, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.core.contributions import group_norms
@@ -202,10 +202,10 @@ class Noticed:
 
 
 def make_subjects(folder: Path) -> dict[str, Subject]:
-    """A store, and one of a replayed data set with two sites."""
+    """A store whose queries see masked keys too, and one of a replayed data set with two sites."""
     subjects = {}
     for name, other in (("joint", 0), ("other", 1)):
-        write_store(folder / f"{name}.zarr", spec=SPEC, seed=other)
+        write_store(folder / f"{name}.zarr", spec=SPEC, seed=other, plant_uniform=every_key_seen)
         replayed = SiteStoreSpec(episodes=2, replans=2, dataset_actions=0.5, protocol="dataset", seed=other)
         write_site_store(folder / f"{name}-sites.zarr", replayed)
     for name in ("", "-sites"):

@@ -16,6 +16,7 @@ from tests.kit.stores import reseal, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import select
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.precision import as_read
 from vla_attention.schemas.stores.content_rules import add_up, row_sum_bound
 from vla_attention.schemas.stores.reader import open_store
@@ -147,3 +148,45 @@ def test_what_is_quickly_held_to_add_up_does(bits, keys):
         assert add_up(exact, sums, bits) <= expected
         assert add_up(exact, sums, bits) == expected or bound < 1e-4
     assert not add_up(np.where(np.arange(keys) == 3, np.float32(np.nan), rounded), sums, bits)
+
+
+def tiny(_task: int, _episode: int, _tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+    """Every other key gets less than float16 of p x 2^15 holds with ten bits, the others share the rest."""
+    small = rows.copy()
+    small[..., ::2] *= np.float32(2.0**-32)
+    return small / small.sum(axis=-1, keepdims=True)
+
+
+def test_tiny_probabilities_do_not_depend_on_how_the_processor_takes_subnormal_numbers(tmp_path):
+    torch = pytest.importorskip("torch")
+    store = open_store(write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, plant_rows=tiny))
+    selection = select(store.attributes)
+
+    def read() -> list[np.ndarray]:
+        return [part.rows.copy() for part in layer_rows(store.attributes, store.episodes[0], selection, "joint")]
+
+    expected = read()
+    assert np.mean([((rows > 0) & (rows < 2.0**-29)).mean() for rows in expected]) > 0.3
+    assert torch.set_flush_denormal(True)
+    try:
+        found = read()
+    finally:
+        torch.set_flush_denormal(False)
+    assert all(map(np.array_equal, found, expected))
+
+
+@pytest.mark.parametrize(("bits", "names"), [(10, ["'bowl'"]), (23, [])])
+def test_a_note_names_what_rounding_may_have_changed(tmp_path, capsys, bits, names):
+    def hardly_read(_task: int, _episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
+        small = rows.copy()
+        for replan, words in enumerate(tokens.words[prompt] for prompt in tokens.prompt_index):
+            for word in words:
+                small[replan, ..., list(word.keys)] *= np.float32(1e-9 if word.text == "bowl" else 1)
+        return small / small.sum(axis=-1, keepdims=True)
+
+    path = write_store(tmp_path / "a.zarr", tasks=(0,), mantissa_bits=bits, plant_rows=hardly_read)
+    assert main(["words", str(path), "--no-plots", "--no-cache", "--output", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert ("--precision exact" in said) is bool(names)
+    assert all(name.strip("'") in said for name in names)
+    assert "plate" not in said

@@ -21,7 +21,7 @@ from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import open_store
 
-MOST_FILES = 49
+MOST_FILES = 45
 WHERE = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "30")
 TINY = ("--checkpoint", "untrained-tiny")
 CAMERAS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}

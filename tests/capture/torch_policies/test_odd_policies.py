@@ -385,7 +385,7 @@ def test_masks_of_every_depth(tmp_path, dtype, low, how):
     image, masked = Role.IMAGE, Role.MASKED_IMAGE
     assert episode.read("joint/key_role")[0, 2] == (masked if hidden[:, 2].all() else image)
     uniform = np.where(hidden, 0, 1 / (KEYS - hidden.sum(-1, keepdims=True)))
-    stored = np.broadcast_to(episode.read("joint/uniform")[0, 0, 0, 0], uniform.shape)
+    stored = np.broadcast_to(episode.uniform("joint")[0, 0, 0, 0], uniform.shape)
     np.testing.assert_allclose(stored, uniform, rtol=1e-6)
 
 

@@ -52,19 +52,34 @@ def test_equals_zarr_python(tmp_path_factory, shape, dtype, data):
 
 
 @GENERATED
-@given(shape=st.tuples(*(st.integers(1, high) for high in (9, 3, 2, 2, 2, 17))), block=st.integers(1, 10))
-def test_layers_are_those_of_the_whole_in_memory_that_is_used_again(tmp_path_factory, shape, block):
+@given(
+    shape=st.tuples(*(st.integers(1, high) for high in (9, 3, 2, 2, 2, 17))),
+    chunk=st.tuples(st.integers(1, 10), st.integers(1, 18)),
+    dtype=st.sampled_from([np.float16, np.float32]),
+    data=st.data(),
+)
+def test_layers_are_those_of_the_whole_in_memory_that_is_used_again(tmp_path_factory, shape, chunk, dtype, data):
+    block, of_key = chunk
     folder = tmp_path_factory.mktemp("array") / "rows"
-    values = np.random.default_rng(block).random(shape, dtype=np.float32)
-    shard = (-(-shape[0] // block) * block, *shape[1:])
-    write_array(folder, values, chunks=(block, 1, 1, *shape[3:]), shards=shard)
+    values = np.random.default_rng(block).random(shape, dtype=np.float32).astype(dtype)
+    scale = 2.0**-15 if dtype == np.float16 else None
+    shard = (-(-shape[0] // block) * block, *shape[1:-1], -(-shape[-1] // of_key) * of_key)
+    attributes = {} if scale is None else {"scale_factor": scale}
+    write_array(folder, values, chunks=(block, 1, 1, *shape[3:-1], of_key), shards=shard, attributes=attributes)
     array = array_in(folder)
+    expected = values.astype(np.float32) * np.float32(scale or 1)
+    np.testing.assert_array_equal(array.read(), expected)
+    np.testing.assert_array_equal(array.read_stored(), values)
     places = [(layer, denoise) for layer in range(shape[1]) for denoise in range(shape[2])]
-    first = None
-    for (layer, denoise), read in zip(places, array.layers(places), strict=True):
-        np.testing.assert_array_equal(read, values[:, layer, denoise])
-        first = read if first is None else first
-        assert np.shares_memory(read, first)
+    begin = data.draw(st.integers(0, shape[-1] - 1))
+    keys = array.metadata.whole_chunks(begin, data.draw(st.integers(begin + 1, shape[-1])))
+    for wanted in (None, keys):
+        first = None
+        for (layer, denoise), read in zip(places, array.layers(places, wanted), strict=True):
+            of_keys = slice(None) if wanted is None else slice(wanted.start, wanted.stop)
+            np.testing.assert_array_equal(read, expected[:, layer, denoise, ..., of_keys])
+            first = read if first is None else first
+            assert np.shares_memory(read, first)
 
 
 def test_every_flipped_byte_of_a_chunk_or_the_index_is_noticed(tmp_path):
