@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import version
@@ -29,7 +29,7 @@ from vla_attention.analyze.cache.kept_files import (
     read_arrays,
     write_file,
 )
-from vla_attention.analyze.cache.places import cache_place, check_cache_place
+from vla_attention.analyze.cache.places import CachePlace, cache_place, check_cache_place
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
@@ -118,64 +118,91 @@ class CachedQuestion:
 
 
 def remembered(
-    question: CachedQuestion,
+    questions: Sequence[CachedQuestion | None],
     episodes: Sequence[StoredEpisode],
-    measure: Callable[[Sequence[int]], Iterable[Arrays]],
-    arguments: Sequence[Any],
+    measure: Callable[[Sequence[tuple[int, Sequence[int]]]], Iterable[list[Any]]],
+    arguments: Sequence[Mapping[int, Any]],
     progress: Callable[[int], object],
-) -> Iterator[Arrays]:
-    """The numbers of every episode, in order; those from the cache are bit for bit those that were measured.
+) -> Iterator[dict[int, Any]]:
+    """The numbers of every episode, in order, by question; from the cache they are bit for bit what was measured.
 
     Args:
-        question: what is measured.
+        questions: what is measured; None where it is not cached.
         episodes: the episodes.
-        measure: called with the positions of the episodes to measure, if there are any; gives their arrays in this
-            order, each as soon as it is known. It reports its own progress. It is called again for an episode whose
-            numbers in the cache turn out to be damaged.
-        arguments: what the numbers depend on that differs between episodes, a JSON value for each of them.
+        measure: called with the positions of the episodes to measure, each with the questions, if there are any; gives
+            in this order what each episode answers to its questions, as soon as it is known. It reports its own
+            progress. It is called again for an episode whose numbers in the cache turn out to be damaged.
+        arguments: by question: position of an episode of which it is asked -> what the numbers depend on that differs
+            between episodes, a JSON value.
         progress: called with the number of episodes that need not be measured.
     """
+    of_episode = [[j for j, asked in enumerate(arguments) if i in asked] for i in range(len(episodes))]
     place = cache_place()
     if place is None:
-        yield from measure(range(len(episodes)))
+        wanted = [(i, of) for i, of in enumerate(of_episode) if of]
+        measured = iter(measure(wanted) if wanted else ())
+        for of in of_episode:
+            yield dict(zip(of, next(measured), strict=True)) if of else {}
         return
     check_cache_place(place)
-    folder, room = place.folder / question.digest.hex()[:32], place.most_bytes
+    room = place.most_bytes
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
-    keys = [_key(question.digest, episode, one) for episode, one in zip(episodes, arguments, strict=True)]
-    paths = [folder / f"{(key or b'').hex()[:32]}{ENDING}" for key in keys]
-    kept = {entry.name for entry in entries(folder)}
-    missing = [i for i, (key, path) in enumerate(zip(keys, paths, strict=True)) if key is None or path.name not in kept]
-    if len(missing) < len(episodes):
-        progress(len(episodes) - len(missing))
-    measured = iter(measure(missing) if missing else ())
-    to_measure = set(missing)
+    keys: dict[tuple[int, int], bytes | None] = {}
+    missing = []
+    kept = {asked.digest: {one.name for one in entries(_folder(place, asked))} for asked in questions if asked}
+    for i, episode in enumerate(episodes):
+        state = file_state(episode) if any(questions[j] for j in of_episode[i]) else None
+        for j in of_episode[i]:
+            asked = questions[j]
+            keys[i, j] = None if asked is None or state is None else _key(asked, episode, state, arguments[j][i])
+        missing.append([j for j in of_episode[i] if not _is_kept(keys[i, j], questions[j], kept)])
+    wanted = [(i, of) for i, of in enumerate(missing) if of]
+    if len(wanted) < len(episodes):
+        progress(len(episodes) - len(wanted))
+    measured = iter(measure(wanted) if wanted else ())
     try:
-        for i, (key, path) in enumerate(zip(keys, paths, strict=True)):
+        for i in range(len(episodes)):
+            found = dict(zip(missing[i], next(measured), strict=True)) if missing[i] else {}
             # Read when its turn comes: numbers of thousands of episodes would not fit into memory.
-            arrays = None if i in to_measure or key is None else read_arrays(path, key)
-            if arrays is None:
-                arrays = next(measured) if i in to_measure else next(iter(measure([i])))
-                if key is not None:
-                    content = kept_bytes(key, arrays)
-                    # A question that alone is larger than the cache keeps its first episodes: dropping them for later
-                    # ones would leave nothing for the next time.
-                    room -= len(content)
-                    try:
-                        if room >= 0:
-                            write_file(path, content)
-                    except OSError:
-                        room = -1  # no room on the disk, or a folder that others own
-            yield arrays
+            known = {j: _read(place, questions[j], keys[i, j]) for j in of_episode[i] if j not in found}
+            if damaged := [j for j, arrays in known.items() if arrays is None]:
+                found |= dict(zip(damaged, next(iter(measure([(i, damaged)]))), strict=True))
+            for j, arrays in found.items():
+                asked, key = questions[j], keys[i, j]
+                if asked is None or key is None:
+                    continue
+                content = kept_bytes(key, arrays)
+                # A question that alone is larger than the cache keeps its first episodes: dropping them for later
+                # ones would leave nothing for the next time.
+                room -= len(content)
+                try:
+                    if room >= 0:
+                        write_file(_folder(place, asked) / _file(key), content)
+                except OSError:
+                    room = -1  # no room on the disk, or a folder that others own
+            yield {j: found[j] if j in found else known[j] for j in of_episode[i]}
     finally:
         # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
         make_room(place.folder, place.most_bytes)
 
 
-def _key(question: bytes, episode: StoredEpisode, arguments: Any) -> bytes | None:
-    """The digest of question and episode, as its files are at the moment; None when these are not to be trusted."""
-    state = file_state(episode)
-    if state is None:
-        return None
+def _folder(place: CachePlace, question: CachedQuestion) -> Path:
+    return place.folder / question.digest.hex()[:32]
+
+
+def _file(key: bytes) -> str:
+    return f"{key.hex()[:32]}{ENDING}"
+
+
+def _is_kept(key: bytes | None, question: CachedQuestion | None, kept: Mapping[bytes, Container[str]]) -> bool:
+    return key is not None and question is not None and _file(key) in kept[question.digest]
+
+
+def _read(place: CachePlace, question: CachedQuestion | None, key: bytes | None) -> Arrays | None:
+    return None if question is None or key is None else read_arrays(_folder(place, question) / _file(key), key)
+
+
+def _key(question: CachedQuestion, episode: StoredEpisode, state: bytes, arguments: Any) -> bytes:
+    """The digest of question and episode, as its files are at the moment."""
     about = f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}\n".encode()
-    return hashlib.sha256(question + state + about).digest()
+    return hashlib.sha256(question.digest + state + about).digest()

@@ -18,11 +18,11 @@ from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.axes import COLUMNS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.naming import at_objects, course, naming
-from vla_attention.analyze.core.object_maps import object_maps, over_place
+from vla_attention.analyze.core.object_maps import look_at_maps, over_place
 from vla_attention.analyze.core.object_shares import (
     CLASSES,
     ITEM,
-    measure_objects,
+    look_at_objects,
     object_episodes,
     object_times,
     with_coverage,
@@ -30,6 +30,7 @@ from vla_attention.analyze.core.object_shares import (
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, frame_of_episodes
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import scan
 from vla_attention.schemas.errors import plural
 
 _AVERAGE = pl.col("layer") == LAYERS_AVG
@@ -63,8 +64,9 @@ def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> R
     sampling, kept, of_layers = question.sampling, columns_of(by), "layer" in by
     looks = [*(["layer_number"] if of_layers else []), *(column.name for column in kept)]
     of_maps = not set(by) - set(_OF_MAPS)
-    found = object_maps(question, "head" in by, of_layers, iou) if of_maps else []
-    measured = measure_objects(question, by)
+    maps = [look_at_maps(question, "head" in by, of_layers, iou)] if of_maps else []
+    measured, *rest = scan(question, [look_at_objects(question, by), *maps])
+    found = rest[0] if rest else []
     episodes, values, quotients = object_episodes(measured, by), _SHARES, {}
     if of_maps:
         place, keys = over_place(question, found).lazy(), [*EPISODE_ID, "layer", "head", *_OBJECT]

@@ -250,8 +250,8 @@ def camera_names(question: Question, wanted: Sequence[str] | None = None) -> tup
 def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[str]) -> EpisodeMaps:
     """Read one episode's attention, mean over the selected layers, denoise steps and heads."""
     tokens, selection = item.tokens, question.selection
-    rows = layer_rows(item.store.attributes, item.episode, selection, question.site, per_head=True)
-    parts = [part.rows.mean(axis=1, dtype=np.float64) for part in rows if part.layer in selection.once]
+    rows = layer_rows(item.store.attributes, item.episode, selection, question.site, per_head=False)
+    parts = [part.rows[:, 0].astype(np.float64) for part in rows if part.layer in selection.once]
     mean = sum(parts, np.zeros(())) / len(parts)  # (replan, key)
     # Of a patch beside a picture that was fitted in, what shows the picture counts.
     shown = np.ones(mean.shape[1]) if tokens.border is None else 1.0 - tokens.border

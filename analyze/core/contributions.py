@@ -35,8 +35,8 @@ from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.result import Column, Table
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Axis, frame_of_episodes, long_table
 from vla_attention.analyze.measures.masses import finite_mean, ratio, uniform_keys, uniform_masses
-from vla_attention.analyze.measures.not_in_memory import OnDisk
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import OnDisk
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
@@ -231,7 +231,9 @@ def side_norms(question: Question) -> Norms | None:
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
     each = partial(_sides_of_episode, selection=selection, layers=question.settings.layers)
-    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
+    norms: OnDisk[_Episode] = OnDisk(
+        lambda i, arrays: (selected[i], arrays), contents=each_episode(each, _fresh(selected))
+    )
     if not all(arrays for _, arrays in norms):
         return None
     return Norms(norms, selection, *_SIDES)
@@ -243,7 +245,9 @@ def group_norms(question: Question) -> Norms | None:
     if not all(store.attributes.recording.contributions for store in question.stores):
         return None
     each = partial(_groups_of_episode, selection=selection, site=question.site, grouping=grouping)
-    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
+    norms: OnDisk[_Episode] = OnDisk(
+        lambda i, arrays: (selected[i], arrays), contents=each_episode(each, _fresh(selected))
+    )
     # A group that cannot be measured in one episode would be a mean over the others only.
     names = set.intersection(*(set(arrays["norms"]) for _, arrays in norms))
     if not names:
@@ -320,8 +324,8 @@ def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str)
     present = members.any(axis=1)
     parts = {}
     for i, name in enumerate(resolved.names):
-        weights = weights_on_segments(resolved.weights[:, :, i : i + 1], members)
-        if weights is None:
+        weights, cut = weights_on_segments(resolved.weights[:, :, i : i + 1], members)
+        if cut.any():
             continue
         taken = weights[:, :, 0].max(axis=0)
         if np.isin(taken, (0.0, 1.0)).all() and (~present | (weights[:, :, 0] == taken)).all():

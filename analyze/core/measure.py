@@ -8,8 +8,7 @@ heads (and for "layers_avg" over layers), unless these axes are kept.
 from __future__ import annotations
 
 import hashlib
-import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
@@ -26,13 +25,13 @@ from vla_attention.analyze.measures.frames import (
     long_table,
 )
 from vla_attention.analyze.measures.masses import finite_mean, masses, uniform_keys, uniform_masses
-from vla_attention.analyze.measures.not_in_memory import OnDisk, measured_once
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, OnDisk, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.parallel import each_episode
-from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.rows import LayerRows
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.errors import Note, listing
+from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.resolve import counted_keys, once_if_unchanged
 from vla_attention.schemas.precision import key_error_bound
 from vla_attention.schemas.safe_text import visible
@@ -114,51 +113,64 @@ def measure(
     keep: Collection[str] = (),
     check: Callable[[Sequence[Array]], None] = lambda num_keys: None,
 ) -> Sequence[Measured]:
-    """Measure the items of every selected episode; a terminal sees the progress.
+    """Measure the items of every selected episode, see `look_at`."""
+    (measured,) = scan(question, [look_at(question, items_of, keep, check)])
+    return measured
 
-    The arrays are kept on disk, and read when an episode is asked for. What the cache holds of them is not measured
-    again; its key has a digest of the weights.
+
+def look_at(
+    question: Question,
+    items_of: Callable[[SelectedEpisode], Items],
+    keep: Collection[str] = (),
+    check: Callable[[Sequence[Array]], None] = lambda num_keys: None,
+    positions: Sequence[int] | None = None,
+) -> Look[Measured]:
+    """The look at the items of every selected episode; what the cache holds of it has a key with the weights' digest.
 
     Args:
         question: stores, selection and site.
         items_of: gives the items of an episode; a function of a module, or a `functools.partial` of one.
         keep: "denoise" and "head" are kept apart where they are here, see `axes.OF_ROWS`.
-        check: called before anything is measured with the most keys of the items at a replan, (1, item) per episode.
+        check: called at once with the most keys of the items at a replan, (1, item) per episode.
+        positions: of the episodes that are measured; all unless given.
     """
     chosen, selection = question.selected, replace(question.selection, per_head="head" in keep)
-    fresh = (item.fresh() for item in chosen)
-    described: OnDisk[_Described] = OnDisk(each_episode(partial(_described, items_of=items_of), fresh))
+    places = range(len(chosen)) if positions is None else positions
+    fresh = (chosen[i].fresh() for i in places)
+    described: OnDisk[_Described] = OnDisk(contents=each_episode(partial(_described, items_of=items_of), fresh))
     check([one.keys for one in described])
-    each = partial(_measured, items_of=items_of, selection=selection, site=question.site, denoise="denoise" in keep)
-    arguments, digests = {"denoise": "denoise" in keep}, [one.digest for one in described]
-    arrays = measured_once(
-        "items", chosen, selection, question.site, each, arguments, digests, lambda i: (chosen[i].fresh(), described[i])
-    )
-
+    number = {i: at for at, i in enumerate(places)}
     unsure: dict[str, None] = {}
 
-    def kept() -> Iterator[dict[str, NDArray[Any]]]:
-        for i, content in enumerate(arrays):
+    def remark(i: int | None, content: dict[str, NDArray[Any]]) -> str | None:
+        if i is not None:
             found = content.pop("unsure")
             if found.any():
-                labels = described[i].labels
+                labels = described[number[i]].labels
                 names = next((labels[name] for name in ("item", "group") if name in labels), [*labels.values()][-1])
                 unsure.update(dict.fromkeys(names.filter(pl.Series(found)).drop_nulls().to_list()))
-            yield content
+        elif unsure:
+            return (
+                f"Some policy calls give {visible(listing(unsure, 4))} so little attention that rounding at capture "
+                f"may have changed it by more than {_UNSURE:.0%}; a capture with --precision exact keeps it."
+            )
+        return None
 
     def made(i: int, content: dict[str, NDArray[Any]]) -> Measured:
-        about = described[i]
+        about = described[number[i]]
         return Measured(chosen[i], selection, about.labels, about.absent, **content)
 
-    measured = OnDisk(kept(), made)
-    if unsure:
-        warnings.warn(
-            f"Some policy calls give {visible(listing(unsure, 4))} so little attention that rounding at capture may "
-            f"have changed it by more than {_UNSURE:.0%}; a capture with --precision exact keeps it.",
-            Note,
-            stacklevel=2,
-        )
-    return measured
+    return Look(
+        "items",
+        partial(_ItemMasses, items_of=items_of, denoise="denoise" in keep),
+        selection.per_head,
+        made,
+        {"denoise": "denoise" in keep},
+        [one.digest for one in described],
+        lambda i: described[number[i]],
+        positions,
+        remark,
+    )
 
 
 @dataclass(frozen=True)
@@ -187,63 +199,89 @@ def _described(item: SelectedEpisode, items_of: Callable[[SelectedEpisode], Item
     return _Described(items.labels, items.absent, whole, kept, keys, digest.hexdigest())
 
 
-def _measured(
-    given: tuple[SelectedEpisode, _Described],
-    items_of: Callable[[SelectedEpisode], Items],
-    selection: Selection,
-    site: str,
-    denoise: bool,
-) -> dict[str, NDArray[Any]]:
-    """The arrays of a `Measured` by name."""
-    item, about = given
-    weights = items_of(item).with_totals(item) if about.weights is None else about.weights
-    replans, steps = item.tokens.num_replans, len(selection.denoise)
-    heads = len(selection.heads) if selection.per_head else 1
-    of_segments, rounded = _segment_weights(item, weights, site), 0.0
-    if of_segments is not None:
+class _ItemMasses:
+    """The arrays of a `Measured`: of items that are made of whole segments from their stored masses, else from rows.
+
+    An item that cuts a segment gets its part of the segment's stored mass, which the rounded rows tell: parts of a
+    segment add up to it, and an item's mass does not depend on what else is measured.
+    """
+
+    def __init__(
+        self,
+        item: SelectedEpisode,
+        selection: Selection,
+        site: str,
+        about: _Described,
+        items_of: Callable[[SelectedEpisode], Items],
+        denoise: bool,
+    ) -> None:
+        self.item, self.selection, self.site, self.about, self.denoise = item, selection, site, about, denoise
+        self.weights = items_of(item).with_totals(item) if about.weights is None else about.weights
+        tokens, segments = item.tokens, item.episode.attributes.segments[site]
+        members = segment_members(tokens.layout, tokens.static_roles, segments)
+        self.of_segments, self.cut = weights_on_segments(self.weights, members)
         atoms = _selected_cells(item.episode.read(f"{site}/atoms"), selection).mean(axis=-2)
-        mass = masses(atoms if selection.per_head else atoms.mean(axis=3, keepdims=True), of_segments)
-        mass = mass if denoise else mass.mean(axis=2, keepdims=True)
-    else:
-        rounded = key_error_bound(item.store.attributes.recording.mantissa_bits)
-        mass = np.zeros((replans, len(selection.layers), steps if denoise else 1, heads, weights.shape[2]))
-        for part in layer_rows(item.store.attributes, item.episode, selection, site):
-            found = masses(part.rows, weights)
-            mass[:, part.layer, part.denoise if denoise else 0] += found if denoise else found / steps
-    uniform = uniform_masses(uniform_keys(item, selection), weights)
-    uniform = uniform if denoise else uniform.mean(axis=2, keepdims=True)
-    keys = counted_keys(weights, item.tokens.existing)[:, :-2]
-    far = rounded * keys[:, None, None, None] > _UNSURE * mass[..., :-2]
-    # Keys that the run has cut off have no attention, to the last bit.
-    far &= (mass[..., :-2] > 0) if item.store.attributes.interventions.keys else (uniform[..., :-2] > 0)
-    # As they were before storage rounded the rows.
-    row_sum = _selected_cells(item.episode.read(f"{site}/row_sum"), selection).mean(axis=-1)
-    row_sum = (row_sum if selection.per_head else row_sum.mean(axis=-1, keepdims=True)).astype(np.float64)
-    arrays = {
-        "mass": mass[..., :-2],
-        "whole": mass[..., -2] if about.whole is None else mass[..., : about.whole].sum(axis=-1),
-        "valid": mass[..., -1],
-        "keys": keys,
-        "unsure": far.any(axis=(0, 1, 2, 3)),
-        "uniform": uniform[..., :-2],
-        "uniform_valid": uniform[..., -1],
-        "row_sum": row_sum if denoise else row_sum.mean(axis=2, keepdims=True),
-        "num_valid": item.num_valid,
-        "env_step": item.episode.read("env_step").astype(np.int64),
-        "denoise_time": item.episode.read("denoise_time")[list(selection.denoise)].astype(np.float64),
-    }
-    # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
-    return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        self.atoms = atoms if selection.per_head else atoms.mean(axis=3, keepdims=True)
+        # (key, segment) of the items that cut one; then the segments whole.
+        parts, self.pairs = [], []
+        for i in np.flatnonzero(self.cut):
+            of_segment = self.weights[..., i, None] * members
+            for segment in np.flatnonzero(of_segment.any(axis=(0, 1))):
+                self.pairs.append((int(i), int(segment)))
+                parts.append(of_segment[..., segment])
+        self.whole = sorted({segment for _, segment in self.pairs})
+        parts += [np.broadcast_to(members[..., segment], parts[0].shape) for segment in self.whole]
+        self.parts = np.stack(parts, axis=-1).astype(np.float32) if parts else np.zeros((1, 0, 0), np.float32)
+        taken = np.flatnonzero(self.parts.any(axis=(0, 2)))
+        self.keys = range(taken[0], taken[-1] + 1) if taken.size else None
+        if self.keys is not None:
+            self.parts = np.ascontiguousarray(self.parts[:, self.keys.start : self.keys.stop])
+        self.found = np.zeros((*self.atoms.shape[:-1], len(parts)))
 
+    def add(self, part: LayerRows) -> None:
+        """Add the masses of the items that cut a segment."""
+        assert self.keys is not None
+        own = slice(self.keys.start - part.keys.start, self.keys.stop - part.keys.start)
+        self.found[:, part.layer, part.denoise] = masses(part.rows[..., own], self.parts)
 
-def _segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
-    """Weights (replan or 1, key, group) as weights (replan or 1, segment, group); None where a group cuts a segment."""
-    tokens, segments = item.tokens, item.episode.attributes.segments[site]
-    roles = tokens.static_roles
-    # The first replan alone tells most groups that cut a segment.
-    if weights_on_segments(weights[:1], segment_members(tokens.layout, roles[:1], segments)) is None:
-        return None
-    return weights_on_segments(weights, segment_members(tokens.layout, roles, segments))
+    def _masses(self) -> Array:
+        """(replan, layer, denoise or 1, head or 1, item), those of `Items.with_totals`."""
+        mass = masses(self.atoms, self.of_segments)
+        mass[..., self.cut] = 0.0
+        known = self.found[..., len(self.pairs) :] > 0
+        scale = self.atoms[..., self.whole] / np.where(known, self.found[..., len(self.pairs) :], np.inf)
+        for at, (i, segment) in enumerate(self.pairs):
+            mass[..., i] += self.found[..., at] * scale[..., self.whole.index(segment)]
+        return mass if self.denoise else mass.mean(axis=2, keepdims=True)
+
+    def content(self) -> dict[str, NDArray[Any]]:
+        """The arrays by name, and `unsure`: which items rounding may have changed."""
+        item, about, mass, weights = self.item, self.about, self._masses(), self.weights
+        uniform = uniform_masses(uniform_keys(item, self.selection), weights)
+        uniform = uniform if self.denoise else uniform.mean(axis=2, keepdims=True)
+        keys = counted_keys(weights, item.tokens.existing)[:, :-2]
+        rounded = key_error_bound(item.store.attributes.recording.mantissa_bits) * self.cut[:-2] * keys
+        far = rounded[:, None, None, None] > _UNSURE * mass[..., :-2]
+        # Keys that the run has cut off have no attention, to the last bit.
+        far &= (mass[..., :-2] > 0) if item.store.attributes.interventions.keys else (uniform[..., :-2] > 0)
+        # As they were before storage rounded the rows.
+        row_sum = _selected_cells(item.episode.read(f"{self.site}/row_sum"), self.selection).mean(axis=-1)
+        row_sum = row_sum if self.selection.per_head else row_sum.mean(axis=-1, keepdims=True)
+        arrays = {
+            "mass": mass[..., :-2],
+            "whole": mass[..., -2] if about.whole is None else mass[..., : about.whole].sum(axis=-1),
+            "valid": mass[..., -1],
+            "keys": keys,
+            "unsure": far.any(axis=(0, 1, 2, 3)),
+            "uniform": uniform[..., :-2],
+            "uniform_valid": uniform[..., -1],
+            "row_sum": (row_sum if self.denoise else row_sum.mean(axis=2, keepdims=True)).astype(np.float64),
+            "num_valid": item.num_valid,
+            "env_step": item.episode.read("env_step").astype(np.int64),
+            "denoise_time": item.episode.read("denoise_time")[list(self.selection.denoise)].astype(np.float64),
+        }
+        # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
+        return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
 
 
 def _selected_cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:

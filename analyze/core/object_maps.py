@@ -15,7 +15,7 @@ the same. An object that hardly moves between episodes has nearly the same: then
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -40,13 +40,11 @@ from vla_attention.analyze.core.pointing_and_iou import (
 )
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, Axis, head_axis, layer_axis, long_table, with_average
 from vla_attention.analyze.measures.masses import finite_mean
-from vla_attention.analyze.measures.not_in_memory import OnDisk
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
-from vla_attention.analyze.stores.parallel import each_episode
-from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.rows import LayerRows
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.progress_bar import progress_bar
 
 Array = NDArray[np.float64]
 #: Percentiles of a map from which on its patches are the attended region.
@@ -93,18 +91,25 @@ class ObjectMaps:
 
 
 def object_maps(question: Question, heads: bool, layers: bool, iou: bool) -> Sequence[ObjectMaps]:
-    """Read the maps of every episode of a question `with_coverage`; shows progress at a terminal.
+    """The maps of every episode of a question `with_coverage`, see `look_at_maps`."""
+    (found,) = scan(question, [look_at_maps(question, heads, layers, iou)])
+    return found
+
+
+def look_at_maps(
+    question: Question, heads: bool, layers: bool, iou: bool, positions: Sequence[int] | None = None
+) -> Look[ObjectMaps]:
+    """The look at the maps of episodes with coverage.
 
     Args:
         question: stores, selection and site.
         heads: keep heads apart instead of averaging their maps.
         layers: keep the layers of `maps` apart; the other tables always do.
         iou: compare maps with masks, which takes most of the time.
+        positions: of the episodes; all unless given.
     """
-    selection = replace(question.selection, per_head=heads)
-    read = partial(_of_episode, selection=selection, site=question.site, layers=layers, iou=iou)
-    with progress_bar(len(question.selected), "episodes") as advance:
-        return OnDisk(each_episode(read, (item.fresh() for item in question.selected), advance))
+    begin = partial(_EpisodeMaps, layers=layers, iou=iou)
+    return Look("maps", begin, heads, lambda _position, found: found, positions=positions)
 
 
 def over_place(question: Question, found: Sequence[ObjectMaps]) -> pl.DataFrame:
@@ -193,40 +198,55 @@ def _view(item: SelectedEpisode, camera: str, members: NDArray[np.float32]) -> _
     return _View(picture, area, masks.astype(np.float32), hits.astype(np.float32), centres)
 
 
-def _of_episode(item: SelectedEpisode, selection: Selection, site: str, layers: bool, iou: bool) -> ObjectMaps:
-    names, members = names_of(item)
-    views = {camera: _view(item, camera, members) for camera in cameras_of(item)}
-    heads = len(selection.heads) if selection.per_head else 1
-    cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
-    maps = {camera: np.zeros((*cells, len(view.picture.keys)), np.float32) for camera, view in views.items()}
-    for part in layer_rows(item.store.attributes, item.episode, selection, site):
-        for camera, view in views.items():
-            maps[camera][:, part.layer, part.denoise] = part.rows[..., view.picture.keys]
-    of_layers = layer_axis(selection)
-    items: Axis = {label: [name[i] for name in names] for i, label in enumerate(ITEM[1:])}
-    heads_axis = head_axis(selection)
-    pointing, overlaps = [], []
-    for camera, view in views.items() if iou else ():
-        scores = _compared(maps[camera], view)
-        averaged = {name: with_average(array, selection, 0, finite_mean)[None] for name, array in scores.items()}
-        of_regions = {name: averaged.pop(name) for name in ("iou", "iou_chance")}
-        axes: list[Axis] = [{"camera": (camera,)}, of_layers, heads_axis]
-        pointing.append(long_table(item, [*axes, items], {**_of_masks(view), **averaged}, EPISODE_KEYS))
-        thresholds: Axis = {"threshold": [f"p{percentile:g}" for percentile in PERCENTILES]}
-        overlaps.append(long_table(item, [*axes, thresholds, items], of_regions, EPISODE_KEYS))
-    place = slice(None, -1) if layers else slice(-1, None)
-    means = [with_average(array[:1].mean(axis=2, dtype=np.float64), selection)[0, place] for array in maps.values()]
-    of_camera = [array.sum(axis=-1, keepdims=True) for array in means]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        whole = [array / sum(of_camera) for array in means]
-    return ObjectMaps(
-        pl.concat(pointing) if pointing else pl.DataFrame(),
-        pl.concat(overlaps) if overlaps else pl.DataFrame(),
-        np.concatenate(whole, axis=-1).astype(np.float32),
-        np.concatenate([view.area[0] for view in views.values()]),
-        {camera: len(view.picture.keys) for camera, view in views.items()},
-        ({name: list(labels)[place] for name, labels in of_layers.items()}, heads_axis, items),
-    )
+class _EpisodeMaps:
+    """The `ObjectMaps` of an episode."""
+
+    def __init__(
+        self, item: SelectedEpisode, selection: Selection, _site: str, _given: None, layers: bool, iou: bool
+    ) -> None:
+        self.item, self.selection, self.layers, self.iou = item, selection, layers, iou
+        self.names, members = names_of(item)
+        self.views = {camera: _view(item, camera, members) for camera in cameras_of(item)}
+        heads = len(selection.heads) if selection.per_head else 1
+        cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
+        keys = {camera: view.picture.keys for camera, view in self.views.items()}
+        self.maps = {camera: np.zeros((*cells, len(own)), np.float32) for camera, own in keys.items()}
+        every = np.concatenate([*keys.values()])
+        self.keys: range | None = range(every.min(), every.max() + 1)
+
+    def add(self, part: LayerRows) -> None:
+        """Keep what the patches get."""
+        for camera, view in self.views.items():
+            self.maps[camera][:, part.layer, part.denoise] = part.rows[..., view.picture.keys - part.keys.start]
+
+    def content(self) -> ObjectMaps:
+        """The maps, and how they lie on the objects."""
+        item, selection, maps = self.item, self.selection, self.maps
+        of_layers = layer_axis(selection)
+        items: Axis = {label: [name[i] for name in self.names] for i, label in enumerate(ITEM[1:])}
+        heads_axis = head_axis(selection)
+        pointing, overlaps = [], []
+        for camera, view in self.views.items() if self.iou else ():
+            scores = _compared(maps[camera], view)
+            averaged = {name: with_average(array, selection, 0, finite_mean)[None] for name, array in scores.items()}
+            of_regions = {name: averaged.pop(name) for name in ("iou", "iou_chance")}
+            axes: list[Axis] = [{"camera": (camera,)}, of_layers, heads_axis]
+            pointing.append(long_table(item, [*axes, items], {**_of_masks(view), **averaged}, EPISODE_KEYS))
+            thresholds: Axis = {"threshold": [f"p{percentile:g}" for percentile in PERCENTILES]}
+            overlaps.append(long_table(item, [*axes, thresholds, items], of_regions, EPISODE_KEYS))
+        place = slice(None, -1) if self.layers else slice(-1, None)
+        means = [with_average(array[:1].mean(axis=2, dtype=np.float64), selection)[0, place] for array in maps.values()]
+        of_camera = [array.sum(axis=-1, keepdims=True) for array in means]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            whole = [array / sum(of_camera) for array in means]
+        return ObjectMaps(
+            pl.concat(pointing) if pointing else pl.DataFrame(),
+            pl.concat(overlaps) if overlaps else pl.DataFrame(),
+            np.concatenate(whole, axis=-1).astype(np.float32),
+            np.concatenate([view.area[0] for view in self.views.values()]),
+            {camera: len(view.picture.keys) for camera, view in self.views.items()},
+            ({name: list(labels)[place] for name, labels in of_layers.items()}, heads_axis, items),
+        )
 
 
 def _of_masks(view: _View) -> dict[str, NDArray[np.float64]]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.camera_maps import seen_cameras
-from vla_attention.analyze.core.measure import Items, Measured, measure, table_of
+from vla_attention.analyze.core.measure import Items, Measured, look_at, table_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, SceneObject
@@ -92,7 +93,15 @@ def items_of(item: SelectedEpisode) -> Items:
 
 def measure_objects(question: Question, by: Collection[str] = ()) -> Sequence[Measured]:
     """The masses of `items_of` in every episode of a question `with_coverage`."""
-    return measure(question, items_of, [axis for axis in OF_ROWS if axis in by])
+    (measured,) = scan(question, [look_at_objects(question, by)])
+    return measured
+
+
+def look_at_objects(
+    question: Question, by: Collection[str] = (), positions: Sequence[int] | None = None
+) -> Look[Measured]:
+    """The look at the masses of `items_of`; positions: of episodes with coverage, all unless given."""
+    return look_at(question, items_of, [axis for axis in OF_ROWS if axis in by], positions=positions)
 
 
 def object_times(measured: Sequence[Measured]) -> pl.LazyFrame:

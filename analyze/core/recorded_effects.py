@@ -29,8 +29,8 @@ from vla_attention.analyze.core.contributions import joint_norm, selected_gram, 
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.measure import Items, Measured, means, measure
 from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns, frame_of_episodes
-from vla_attention.analyze.measures.not_in_memory import OnDisk
 from vla_attention.analyze.measures.question import Question, select_again
+from vla_attention.analyze.measures.scan import OnDisk
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_episode, vocabulary_of
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
@@ -194,7 +194,7 @@ def recorded_effects(
     together = (
         [item.fresh() for item in items] for items in zip(having, *(at.selected for at, _ in places), strict=True)
     )
-    episodes = OnDisk(each_episode(each, together), made)
+    episodes = OnDisk(made, contents=each_episode(each, together))
     drift = _drift(episodes, units)
     elsewhere = [
         f"Attention to {plural(len(selectors), 'item')} is of site '{at.site}', where the keys are."

@@ -50,10 +50,10 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.contributions import has_all_heads, joint_norm, segment_masses, selected_gram
 from vla_attention.analyze.measures.masses import uniform_keys
-from vla_attention.analyze.measures.not_in_memory import OnDisk, measured_once
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
-from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.rows import LayerRows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing, plural, unknown_name
 from vla_attention.schemas.groupings.resolve import describe_key
@@ -139,10 +139,10 @@ class SinkSearch:
 def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch:
     """Look for sinks in every task, episodes of a task weighing the same; reads all selected rows once."""
     rule = rule or SinkRule()
-    selected, selection, site = question.selected, question.selection, question.site
-    measure = partial(_key_shares, selection=selection, site=site, rule=rule)
-    arrays = measured_once("shares", selected, selection, site, measure, {"factor": rule.factor})
-    shares: OnDisk[dict[str, Array]] = OnDisk(arrays)
+    selected, selection = question.selected, question.selection
+    arguments = {"factor": rule.factor}
+    look = Look("shares", partial(_KeyShares, rule=rule), True, lambda _position, arrays: arrays, arguments)
+    (shares,) = scan(question, [look])
     found = [
         _of_task([selected[i] for i in positions], [shares[i] for i in positions], selection, rule)
         for _, positions in sorted(positions_by_task(selected).items())
@@ -152,35 +152,47 @@ def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch
     return SinkSearch(keys.join(_value_ratios(question, heads), on=on, how="left", maintain_order="left"), heads)
 
 
-def _key_shares(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> dict[str, Array]:
-    """How much each key of an episode takes in each head; blocks count once.
+class _KeyShares:
+    """How much each key of an episode takes in each head; blocks count once."""
 
-    Returns:
-        above: share of the rows in which the key takes more than the factor, (layer, head, key) float32.
-        held: mean over rows of the key's share in the mass of the valid keys, (layer, head, key) float32.
-        uniform: mean over rows of what uniform attention gives the key of that mass, (layer or 1, head or 1, key)
-            float32: 1 / the number of valid keys where every query sees the same.
-    """
-    uniform, valid = uniform_keys(item, replace(selection, per_head=True)), item.valid[:, None, None, None]
-    of_valid = (uniform * valid).sum(axis=-1, keepdims=True)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.where(of_valid > 0, uniform / of_valid, 0.0)
-    # A key that is valid at some replans only takes nothing at the others, and its mean counts them.
-    shares = np.where(valid, shares, 1.0 / np.maximum(item.num_valid, 1)[:, None, None, None, None])
-    above, held = np.zeros((2, len(selection.once), len(selection.heads), item.tokens.layout.num_keys), np.float32)
-    for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
-        if part.layer in selection.once:
-            at, count = selection.once.index(part.layer), len(part.rows) * len(selection.denoise)
-            _, layers, steps, _, _ = shares.shape
-            here = shares[:, part.layer if layers > 1 else 0, part.denoise if steps > 1 else 0]
-            highest = here.max(axis=-1, keepdims=True)
-            # One for all keys where they are alike.
-            here = highest if ((here == 0) | (here >= highest * (1.0 - _ROUNDING))).all() else here
-            in_rows, summed = key_sums(part.rows, item.valid, rule.factor * here)
-            above[at] += (in_rows / count).astype(np.float32)
-            held[at] += (summed / count).astype(np.float32)
-    means = shares.mean(axis=(0, 2)).astype(np.float32)
-    return {"above": above, "held": held, "uniform": means[list(selection.once)] if len(means) > 1 else means}
+    def __init__(self, item: SelectedEpisode, selection: Selection, _site: str, _given: None, rule: SinkRule) -> None:
+        self.item, self.selection, self.rule = item, selection, rule
+        uniform, valid = uniform_keys(item, selection), item.valid[:, None, None, None]
+        of_valid = (uniform * valid).sum(axis=-1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shares = np.where(of_valid > 0, uniform / of_valid, 0.0)
+        # A key that is valid at some replans only takes nothing at the others, and its mean counts them.
+        self.shares = np.where(valid, shares, 1.0 / np.maximum(item.num_valid, 1)[:, None, None, None, None])
+        self.keys: range | None = range(item.tokens.layout.num_keys)
+        sums = np.zeros((2, len(selection.once), len(selection.heads), len(self.keys)), np.float32)
+        self.above, self.held = sums
+
+    def add(self, part: LayerRows) -> None:
+        """Add what the keys take in the rows of a layer."""
+        if part.layer not in self.selection.once:
+            return
+        at, count = self.selection.once.index(part.layer), len(part.rows) * len(self.selection.denoise)
+        _, layers, steps, _, _ = self.shares.shape
+        here = self.shares[:, part.layer if layers > 1 else 0, part.denoise if steps > 1 else 0]
+        highest = here.max(axis=-1, keepdims=True)
+        # One for all keys where they are alike.
+        here = highest if ((here == 0) | (here >= highest * (1.0 - _ROUNDING))).all() else here
+        in_rows, summed = key_sums(part.rows, self.item.valid, self.rule.factor * here)
+        self.above[at] += (in_rows / count).astype(np.float32)
+        self.held[at] += (summed / count).astype(np.float32)
+
+    def content(self) -> dict[str, Array]:
+        """The arrays by name.
+
+        Returns:
+            above: share of the rows in which the key takes more than the factor, (layer, head, key) float32.
+            held: mean over rows of the key's share in the mass of the valid keys, (layer, head, key) float32.
+            uniform: mean over rows of what uniform attention gives the key of that mass, (layer or 1, head or 1, key)
+                float32: 1 / the number of valid keys where every query sees the same.
+        """
+        means = self.shares.mean(axis=(0, 2)).astype(np.float32)
+        of_layers = means[list(self.selection.once)] if len(means) > 1 else means
+        return {"above": self.above, "held": self.held, "uniform": of_layers}
 
 
 def key_sums(

@@ -32,7 +32,7 @@ from vla_attention.schemas.layout import (
     picture_size,
     prompt_at,
 )
-from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, key_error_bound, mass_error_bound
 from vla_attention.schemas.stores.store_format import Recording, RootAttributes
 
 _NOT_FINITE = "holds numbers that are NaN or infinite"
@@ -55,7 +55,7 @@ def row_sum_bound(mantissa_bits: int) -> float:
 
 
 def add_up(rows: NDArray[np.float32], row_sum: NDArray[np.float32], mantissa_bits: int) -> bool:
-    """Whether rows (..., key) have the sums `row_sum` (...), within `row_sum_bound`: one product in float32.
+    """Whether rows (..., key) have the sums `row_sum` (...), as closely as `row_problems` asks: one product in float32.
 
     Where it says no, `row_problems` decides: sums in float32 err by some 1e-6.
     """
@@ -63,7 +63,8 @@ def add_up(rows: NDArray[np.float32], row_sum: NDArray[np.float32], mantissa_bit
         sums = rows.reshape(-1, rows.shape[-1]) @ np.ones(rows.shape[-1], np.float32)
     expected = row_sum.reshape(-1)
     most = np.float32(row_sum_bound(mantissa_bits) - _SUMMATION_TOLERANCE / 2)
-    return bool((np.abs(sums - expected) <= most * expected).all())  # a NaN is in no bound
+    tiny = np.float32(rows.shape[-1] * key_error_bound(mantissa_bits))
+    return bool((np.abs(sums - expected) <= most * expected + tiny).all())  # a NaN is in no bound
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,8 @@ def row_problems(
     yield from _faults(name, "holds negative numbers", negative, recording, first_replan)
     expected = row_sum.astype(np.float64)
     bound = row_sum_bound(mantissa_bits)
-    error = np.abs(sums - expected) / np.maximum(np.abs(expected), 1e-30)
+    apart = np.maximum(np.abs(sums - expected) - values.shape[-1] * key_error_bound(mantissa_bits), 0)
+    error = apart / np.maximum(np.abs(expected), 1e-30)
     differs = np.isfinite(error) & (error > bound)
     most = error.max(initial=0, where=differs)
     says = f"does not add up to the row sums: they differ by up to {most:.2g} of them, allowed is {bound:.2g},"

@@ -105,10 +105,13 @@ class StoredArray:
         keys, of_key = range(shape[-1]) if keys is None else keys, rest[-1]
         of_keys = range(keys.start // of_key, -(-keys.stop // of_key))
         blocks, along_keys = self.metadata.grid[0], self.metadata.grid[-1]
-        values = np.empty((blocks * block, *shape[3:-1], len(keys)), self.metadata.read_dtype)
-        # A chunk that is all there is of some replans is decoded where it belongs.
-        in_place = not self.metadata.is_half and len(of_keys) == 1 and len(keys) == of_key
-        decoded = None if in_place else np.empty((block, *shape[3:-1], of_key), self.metadata.dtype)
+        stored = np.empty((blocks * block, *shape[3:-1], len(keys)), self.metadata.dtype)
+        values = np.empty(stored.shape, np.float32) if self.metadata.is_half else stored
+        # A chunk that is all there is of some replans is decoded where it belongs, others are copied there: converted
+        # are all of a layer at once, since numpy is slow with rows of a few hundred numbers.
+        decoded = (
+            None if len(of_keys) == 1 and len(keys) == of_key else np.empty((block, *shape[3:-1], of_key), stored.dtype)
+        )
         memory = np.empty(0, np.uint8)
         for layer, denoise in places:
             if not (0 <= layer < shape[1] and 0 <= denoise < shape[2]):
@@ -118,20 +121,14 @@ class StoredArray:
                 numbers = range(first + of_keys.start, first + of_keys.stop)
                 if self._shard is not None and memory.size < self._shard.size(numbers):
                     memory = np.empty(self._shard.size(numbers), np.uint8)
-                rows = values[i * block : (i + 1) * block]
+                rows = stored[i * block : (i + 1) * block]
                 for number, frame in self._frames(numbers, memory):
-                    if decoded is None:
-                        self._decode(number, frame, rows)
-                        continue
-                    self._decode(number, frame, decoded)
-                    begin = (number - first) * of_key
-                    into = rows[: shape[0] - i * block, ..., begin - keys.start : begin - keys.start + of_key]
-                    part = decoded[: len(into), ..., : into.shape[-1]]
-                    if self.metadata.is_half:
-                        self.values_of(part, into)
-                    else:
-                        into[...] = part
-            yield values[: shape[0]]
+                    self._decode(number, frame, rows if decoded is None else decoded)
+                    if decoded is not None:
+                        begin = (number - first) * of_key - keys.start
+                        into = rows[..., begin : begin + of_key]
+                        into[...] = decoded[..., : into.shape[-1]]
+            yield self.values_of(stored[: shape[0]], values[: shape[0]])
 
     def _frames(self, numbers: range, memory: Memory | None = None) -> Iterator[tuple[int, memoryview]]:
         """Numbers and encoded bytes of neighbouring chunks. memory: for these bytes."""

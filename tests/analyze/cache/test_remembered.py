@@ -22,8 +22,8 @@ from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.cache import remembered
 from vla_attention.analyze.cache.kept_files import kept_files
-from vla_attention.analyze.core import measure
 from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.measures import scan
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.capture.store import site_writer
@@ -61,13 +61,13 @@ def stores(originals, tmp_path) -> tuple[Path, Path]:
 def measured(monkeypatch) -> list[str]:
     """The names of the episodes that are measured from now on."""
     names: list[str] = []
-    one = measure._measured
+    one = scan._scanned
 
-    def watched(given: Any, **settings: Any) -> dict[str, Any]:
+    def watched(given: Any, **settings: Any) -> list[Any]:
         names.append(given[0].episode.name)
         return one(given, **settings)
 
-    monkeypatch.setattr(measure, "_measured", watched)
+    monkeypatch.setattr(scan, "_scanned", watched)
     return names
 
 

@@ -91,8 +91,8 @@ def test_clicked_patches_and_words_are_a_group_and_its_ratio(view, server, store
     result = va.open(store).analyze(groups=selectors, ratio=("patch", "word"), tasks=0)["replans_groups"]
     cells = result.filter(episode_index=0, replan=0, layer="layers_avg")
     expected = dict(cells.select("group", "mass").iter_rows())
-    assert view.value('[data-number="own-patches"]') == pytest.approx(expected["patch"], rel=1e-5)
-    assert view.value('[data-number="own-words"]') == pytest.approx(expected["word"], rel=1e-5)
+    assert view.value('[data-number="own-patches"]') == pytest.approx(expected["patch"], rel=2**-10)
+    assert view.value('[data-number="own-words"]') == pytest.approx(expected["word"], rel=2**-10)
     # A typed selector is resolved by the server, and so is what is wrong with it.
     view.page.fill('[aria-label="Selector"]', "word:nothing")
     view.page.locator(".own form button").first.click()
@@ -153,7 +153,7 @@ def test_both_episodes_have_heads_and_the_own_group(view, server, store):
     word = about["sites"]["joint"]["prompts"][0]["words"][0]["text"]
     result = va.open(store).analyze(groups={"word": f"word:{word}"}, tasks=0)["replans_groups"]
     cells = result.filter(group="word", replan=1, layer="layers_avg").sort("episode_index")
-    assert shown == pytest.approx(cells["mass"].to_list(), rel=1e-5)
+    assert shown == pytest.approx(cells["mass"].to_list(), rel=2**-10)
 
 
 def test_the_overview_finds_episodes(view, server, store):
