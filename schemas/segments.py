@@ -60,18 +60,19 @@ def segment_masses(rows: NDArray[np.float32], members: NDArray[np.bool_]) -> NDA
 def weights_on_segments(
     weights: NDArray[np.float32], members: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Group weights per segment, and which groups do not treat all keys of a segment alike: those need rows.
+    """Group weights per segment, and where a group does not treat all keys of a segment alike: there rows are needed.
 
     Args:
         weights: (replan or 1, key, group), as resolved from a grouping.
         members: (replan or 1, key, segment).
 
     Returns:
-        (replan or 1, segment, group) float32, 0 for a segment without keys at a replan; and (group,).
+        (replan or 1, segment, group) float32, 0 for a segment without keys at a replan, or that the group cuts; and
+        (segment, group), whether it cuts it.
     """
     replans = max(weights.shape[0], members.shape[0])
     result = np.zeros((replans, members.shape[2], weights.shape[2]), dtype=np.float32)
-    cut = np.zeros(weights.shape[2], dtype=bool)
+    cut = np.zeros(result.shape[1:], dtype=bool)
     for segment in range(members.shape[2]):
         keys = np.flatnonzero(members[:, :, segment].any(axis=0))
         if not keys.size:
@@ -82,6 +83,6 @@ def weights_on_segments(
         highest = np.where(inside, values, -np.inf).max(axis=1)
         lowest = np.where(inside, values, np.inf).min(axis=1)
         present = inside.any(axis=1)
-        cut |= (present & (highest != lowest)).any(axis=0)
-        result[:, segment] = np.where(present, highest, 0.0)
+        cut[segment] = (present & (highest != lowest)).any(axis=0)
+        result[:, segment] = np.where(present & ~cut[segment], highest, 0.0)
     return result, cut

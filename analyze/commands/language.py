@@ -17,7 +17,7 @@ from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.exchanged import exchanged
 from vla_attention.analyze.core.listening import LISTENS, listens, table_of_parts
-from vla_attention.analyze.core.naming import named_in
+from vla_attention.analyze.core.naming import ObjectAttention, named_in
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.measures.question import Question
@@ -67,7 +67,8 @@ def _perturbed(question: Question, asked: pl.DataFrame) -> tuple[list[Finding], 
     """By what LIBERO-PRO changed: success, doing what was told, attention to what the task names; none without it."""
     if not any_perturbed(store.suite for store in question.stores):
         return [], []
-    finding, table = perturbations(by_suite(question, asked, named_in(question)))
+    objects = ObjectAttention.measured_in(question)
+    finding, table = perturbations(by_suite(question, asked, [] if objects is None else named_in(objects)))
     return [finding], [table]
 
 

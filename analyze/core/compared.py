@@ -18,15 +18,16 @@ import polars as pl
 from vla_attention.analyze.core.action_changes import ActionUnits, units_of
 from vla_attention.analyze.core.courses import strip
 from vla_attention.analyze.core.estimate import Scale, estimate, with_q
-from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
-from vla_attention.analyze.core.measure import measure, table_of
-from vla_attention.analyze.core.naming import Naming, named_in
+from vla_attention.analyze.core.levels import SIDES, Levels, look_at_groups, task_cells, task_groups
+from vla_attention.analyze.core.measure import Measured, look_at, table_of
+from vla_attention.analyze.core.naming import Naming, ObjectAttention, looks_at_objects, named_in
 from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.pairs import MOST_APART, pairing, pairs_of, with_first_pictures
 from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, float_values
+from vla_attention.analyze.measures.scan import scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.units import Sampling
@@ -52,16 +53,26 @@ class RunValues:
         run: the run.
         episodes: what pairs them, see `pairing`.
         levels: the groups, heads kept apart.
+        words: every word; None where the site spells none.
+        objects: what objects get; None without object coverage.
     """
 
     run: Run
     episodes: pl.DataFrame
     levels: Levels
+    words: Sequence[Measured] | None
+    objects: ObjectAttention | None
 
     @classmethod
     def of(cls, run: Run, ignore_seed: bool) -> RunValues:
-        """Measure a run's groups; `ignore_seed`: episodes of different seeds may be pairs."""
-        return cls(run, pairing(run, ignore_seed), levels_of(run.question, heads=True))
+        """Measure a run's groups, words and objects; `ignore_seed`: episodes of different seeds may be pairs."""
+        question = run.question
+        words = [look_at(question, items_of)] if question.vocabulary.words else []
+        objects = looks_at_objects(question)
+        groups, *rest = scan(question, [look_at_groups(question, heads=True), *words, *objects])
+        found = ObjectAttention.of(question, *rest[len(words) :]) if objects else None
+        levels = Levels(question, groups, heads=True)
+        return cls(run, pairing(run, ignore_seed), levels, rest[0] if words else None, found)
 
     @cached_property
     def values(self) -> Mapping[str, pl.DataFrame]:
@@ -70,17 +81,17 @@ class RunValues:
         Those of words and objects are log2 of their attention over what they would get if it were spread evenly.
         """
         tables = {"groups": values_of_groups(self.levels), "heads": self._heads()}
-        if self.run.question.vocabulary.words:
-            words = table_of(measure(self.run.question, items_of)).filter(pl.col("kind") == "word")
+        if self.words is not None:
+            words = table_of(self.words).filter(pl.col("kind") == "word")
             tables["words"] = words.select(*EPISODE_ID, "item", value=pl.col("lift").log(2.0)).collect()
-        if (objects := object_values(self.run.question)) is not None:
-            tables["objects"] = objects
+        if self.objects is not None:
+            tables["objects"] = object_values(self.objects.measured)
         return tables
 
     @cached_property
     def named(self) -> Sequence[Naming]:
         """What is named against what is not, of each suite in which something shows it."""
-        return named_in(self.run.question)
+        return [] if self.objects is None else named_in(self.objects)
 
     def _heads(self) -> pl.DataFrame:
         """`EPISODE_ID`, layer (a block), head, value: the part of the attention on one side of the ratio."""

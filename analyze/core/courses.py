@@ -16,14 +16,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.measure import measure, table_of
-from vla_attention.analyze.core.object_shares import ALL_CAMERAS, measure_objects, object_times, with_coverage
+from vla_attention.analyze.core.measure import look_at, table_of
+from vla_attention.analyze.core.object_shares import ALL_CAMERAS, cameras_of, look_at_objects, object_times
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.episode_steps import HAND, POSES
-from vla_attention.schemas.errors import BadArgument
 
 Array = NDArray[np.float64]
 
@@ -249,13 +249,15 @@ def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataF
     if not items:
         return found
     part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
-    lifts = table_of(measure(part, items_of), {"replan"}).filter(pl.col("kind") == "word").collect()
+    having = [i for i, item in enumerate(part.selected) if cameras_of(item)]
+    objects = [look_at_objects(part, positions=having)] if having else []
+    words, *rest = scan(part, [look_at(part, items_of), *objects])
+    lifts = table_of(words, {"replan"}).filter(pl.col("kind") == "word").collect()
     most = lifts.drop_nulls("lift").sort("lift", "item", descending=[True, False])
     read = most.group_by(place, maintain_order=True).agg(read=pl.first("item"))
-    try:
-        times = object_times(measure_objects(with_coverage(part))).collect()
-    except BadArgument:  # no object is marked in the pictures: `objects` says why
+    if not rest:  # no object is marked in the pictures: `objects` says why
         return pl.concat([found, read], how="diagonal")
+    times = object_times(rest[0]).collect()
     times = times.filter(camera=ALL_CAMERAS).with_columns(times=pl.col("share") / pl.col("even_share"))
     most = times.filter(pl.col("times").is_finite(), kind="object").sort("times", "item", descending=[True, False])
     looked = most.group_by(place, maintain_order=True).agg(

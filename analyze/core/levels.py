@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.estimate import estimate
-from vla_attention.analyze.core.measure import Items, Measured, measure, table_of
+from vla_attention.analyze.core.measure import Items, Measured, look_at, table_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_not_empty, resolve_episode
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
@@ -112,7 +113,13 @@ class Levels:
 
 
 def levels_of(question: Question, heads: bool = False) -> Levels:
-    """Measure the question's grouping; heads are kept apart where `heads` says so.
+    """Measure the question's grouping; heads are kept apart where `heads` says so. Raises as `look_at_groups`."""
+    (measured,) = scan(question, [look_at_groups(question, heads)])
+    return Levels(question, measured, heads)
+
+
+def look_at_groups(question: Question, heads: bool = False) -> Look[Measured]:
+    """The look at the question's grouping.
 
     Raises:
         SelectorError, EmptyGroup: a group names what no episode has, or has no key in any.
@@ -125,8 +132,7 @@ def levels_of(question: Question, heads: bool = False) -> Levels:
     def check(num_keys: Sequence[NDArray[np.float64]]) -> None:
         check_not_empty(grouping, [keys[:, :names] for keys in num_keys])
 
-    measured = measure(question, partial(items_of, grouping=grouping), keep, check)
-    return Levels(question, measured, heads)
+    return look_at(question, partial(items_of, grouping=grouping), keep, check)
 
 
 def items_of(item: SelectedEpisode, grouping: Grouping) -> Items:

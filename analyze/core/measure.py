@@ -219,16 +219,13 @@ class _ItemMasses:
         self.weights = items_of(item).with_totals(item) if about.weights is None else about.weights
         tokens, segments = item.tokens, item.episode.attributes.segments[site]
         members = segment_members(tokens.layout, tokens.static_roles, segments)
-        self.of_segments, self.cut = weights_on_segments(self.weights, members)
-        atoms = _selected_cells(item.episode.read(f"{site}/atoms"), selection).mean(axis=-2)
+        self.of_segments, cut = weights_on_segments(self.weights, members)
+        self.cut = cut.any(axis=0)
+        atoms = _selected_cells(item.episode.read_once(f"{site}/atoms"), selection).mean(axis=-2)
         self.atoms = atoms if selection.per_head else atoms.mean(axis=3, keepdims=True)
-        # (key, segment) of the items that cut one; then the segments whole.
-        parts, self.pairs = [], []
-        for i in np.flatnonzero(self.cut):
-            of_segment = self.weights[..., i, None] * members
-            for segment in np.flatnonzero(of_segment.any(axis=(0, 1))):
-                self.pairs.append((int(i), int(segment)))
-                parts.append(of_segment[..., segment])
+        # The parts of segments that items take, then the segments whole.
+        self.pairs = [(int(i), int(segment)) for segment, i in np.argwhere(cut)]
+        parts = [self.weights[..., i] * members[..., segment] for i, segment in self.pairs]
         self.whole = sorted({segment for _, segment in self.pairs})
         parts += [np.broadcast_to(members[..., segment], parts[0].shape) for segment in self.whole]
         self.parts = np.stack(parts, axis=-1).astype(np.float32) if parts else np.zeros((1, 0, 0), np.float32)
@@ -247,7 +244,6 @@ class _ItemMasses:
     def _masses(self) -> Array:
         """(replan, layer, denoise or 1, head or 1, item), those of `Items.with_totals`."""
         mass = masses(self.atoms, self.of_segments)
-        mass[..., self.cut] = 0.0
         known = self.found[..., len(self.pairs) :] > 0
         scale = self.atoms[..., self.whole] / np.where(known, self.found[..., len(self.pairs) :], np.inf)
         for at, (i, segment) in enumerate(self.pairs):
@@ -261,11 +257,11 @@ class _ItemMasses:
         uniform = uniform if self.denoise else uniform.mean(axis=2, keepdims=True)
         keys = counted_keys(weights, item.tokens.existing)[:, :-2]
         rounded = key_error_bound(item.store.attributes.recording.mantissa_bits) * self.cut[:-2] * keys
-        far = rounded[:, None, None, None] > _UNSURE * mass[..., :-2]
         # Keys that the run has cut off have no attention, to the last bit.
-        far &= (mass[..., :-2] > 0) if item.store.attributes.interventions.keys else (uniform[..., :-2] > 0)
+        seen = mass if item.store.attributes.interventions.keys else uniform
+        far = (seen[..., :-2] > 0) & (rounded[:, None, None, None] > _UNSURE * mass[..., :-2])
         # As they were before storage rounded the rows.
-        row_sum = _selected_cells(item.episode.read(f"{self.site}/row_sum"), self.selection).mean(axis=-1)
+        row_sum = _selected_cells(item.episode.read_once(f"{self.site}/row_sum"), self.selection).mean(axis=-1)
         row_sum = row_sum if self.selection.per_head else row_sum.mean(axis=-1, keepdims=True)
         arrays = {
             "mass": mass[..., :-2],

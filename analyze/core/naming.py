@@ -34,11 +34,18 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.measure import Measured
-from vla_attention.analyze.core.object_maps import ObjectMaps, object_maps, over_place
-from vla_attention.analyze.core.object_shares import ALL_CAMERAS, cameras_of, measure_objects, object_times
+from vla_attention.analyze.core.object_maps import ObjectMaps, look_at_maps, over_place
+from vla_attention.analyze.core.object_shares import (
+    ALL_CAMERAS,
+    cameras_of,
+    look_at_objects,
+    object_times,
+    with_coverage,
+)
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.left_out import pseudo_values
 from vla_attention.analyze.statistics.units import Units
@@ -94,40 +101,67 @@ def first_calls(measured: Sequence[Measured]) -> pl.DataFrame:
     return object_times(measured).filter(pl.col("replan") == 0, pl.col("kind") == "object").collect()
 
 
-def naming(
-    question: Question, measured: Sequence[Measured] | None = None, found: Sequence[ObjectMaps] | None = None
-) -> Naming:
+def naming(question: Question, measured: Sequence[Measured], found: Sequence[ObjectMaps]) -> Naming:
     """Named against not named in the episodes of a question `with_coverage`.
 
     Args:
         question: its episodes.
-        measured: their `measure_objects`; measured here unless it is given.
-        found: their `object_maps`, heads and layers together; read here where they are needed, unless given.
+        measured: their `measure_objects`.
+        found: their `object_maps`, heads and layers together.
     """
     cases = _cases(question)
     kinds = by_kind(cases.with_columns(camera=pl.lit(ALL_CAMERAS), x=pl.lit(0.0)))
     always = tuple(kinds.filter(pl.col("named").all().over("suite", "item"))["item"].unique().sort())
-    shares = first_calls(measure_objects(question) if measured is None else measured)
+    shares = first_calls(measured)
     x = shares.select(*EPISODE_ID, "camera", "item", x=pl.col("share").log())
     states = cases.filter(pl.col("state") != "").join(x, on=[*EPISODE_ID, "item"])
     states = states.with_columns(stratum=pl.concat_str("suite", "state", separator=" "))
     one = _compared(question, "same state", states, always)
     if one.form is not None or cases.is_empty():
         return one
-    found = object_maps(question, heads=False, layers=False, iou=False) if found is None else found
     x = over_place(question, found).filter(kind="object", layer=LAYERS_AVG)
     x = x.select(*EPISODE_ID, "camera", "item", x=(pl.col("at_place") / pl.col("elsewhere")).log())
     kinds = by_kind(cases.join(x, on=[*EPISODE_ID, "item"]))
     return _compared(question, "other tasks", kinds.with_columns(stratum="suite"), always)
 
 
-def named_in(question: Question) -> list[Naming]:
-    """`naming` of each suite of any question, where it shows something; none without object coverage."""
+@dataclass(frozen=True)
+class ObjectAttention:
+    """What objects get in the episodes whose coverage is known: their question, masses and maps."""
+
+    question: Question
+    measured: Sequence[Measured]
+    maps: Sequence[ObjectMaps]
+
+    @classmethod
+    def of(cls, question: Question, measured: Sequence[Measured], maps: Sequence[ObjectMaps]) -> ObjectAttention:
+        """What the looks of `looks_at_objects` found."""
+        return cls(with_coverage(question), measured, maps)
+
+    @classmethod
+    def measured_in(cls, question: Question) -> ObjectAttention | None:
+        """That of a question, measured now; None without object coverage."""
+        looks = looks_at_objects(question)
+        return cls.of(question, *scan(question, looks)) if looks else None
+
+
+def looks_at_objects(question: Question) -> list[Look[Any]]:
+    """The looks that `ObjectAttention` takes; none without object coverage."""
+    having = [i for i, item in enumerate(question.selected) if cameras_of(item)]
+    if not having:
+        return []
+    maps = look_at_maps(question, heads=False, layers=False, iou=False, positions=having)
+    return [look_at_objects(question, positions=having), maps]
+
+
+def named_in(objects: ObjectAttention) -> list[Naming]:
+    """`naming` of each suite, where it shows something."""
     found = []
-    for suite in dict.fromkeys(store.suite for store in question.stores):
-        selected = tuple(item for item in question.selected if item.store.suite == suite and cameras_of(item))
-        one = naming(replace(question, selected=selected)) if selected else None
-        found += [one] if one is not None and one.form is not None else []
+    for suite in dict.fromkeys(item.store.suite for item in objects.question.selected):
+        own = [i for i, item in enumerate(objects.question.selected) if item.store.suite == suite]
+        of_suite = replace(objects.question, selected=tuple(objects.question.selected[i] for i in own))
+        one = naming(of_suite, [objects.measured[i] for i in own], [objects.maps[i] for i in own])
+        found += [one] if one.form is not None else []
     return found
 
 

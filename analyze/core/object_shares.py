@@ -153,15 +153,13 @@ def object_episodes(measured: Sequence[Measured], by: Collection[str] = ()) -> p
     return table_of(measured, inner, then=then)
 
 
-def object_values(question: Question) -> pl.DataFrame | None:
-    """Log2 of the attention to every object over what its area gives it; None without object coverage.
+def object_values(measured: Sequence[Measured]) -> pl.DataFrame:
+    """Log2 of the attention to every object over what its area gives it.
 
     Returns:
         suite, task_id, episode_index, item, value: of all cameras together, mean over layers and policy calls.
     """
-    if not any(cameras_of(item) for item in question.selected):
-        return None
-    rows = object_episodes(measure_objects(with_coverage(question)))
+    rows = object_episodes(measured)
     rows = rows.filter(camera=ALL_CAMERAS, layer=LAYERS_AVG, kind="object")
     return rows.select(*EPISODE_ID, "item", value=pl.col("enrichment").log(2.0)).collect()
 

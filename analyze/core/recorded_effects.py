@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -185,7 +185,7 @@ def recorded_effects(
     if units is None:
         units = units_of(question.stores, question.settings.units, question.settings.skip_corrupt)
     places = _places(replace(question, selected=tuple(having))) if attention else []
-    measured = [measure(at, partial(_items, selectors=selectors), "effects") for at, selectors in places]
+    measured = [measure(at, partial(selected_items, selectors=selectors), "effects") for at, selectors in places]
     each = partial(_arrays, units=units, places=[(at.site, at.selection, selectors) for at, selectors in places])
 
     def made(i: int, arrays: Mapping[str, Any]) -> _Episode:
@@ -299,9 +299,13 @@ def _grouping(selectors: Sequence[str]) -> Grouping:
     return Grouping("effects", members, overlap=True, allow_empty=tuple(members))
 
 
-def _items(item: SelectedEpisode, selectors: Sequence[str]) -> Items:
+def selected_items(
+    item: SelectedEpisode, selectors: Sequence[str], absent: Literal["left out", "zero"] = "left out"
+) -> Items:
+    """What each selector takes as an item."""
     weights = resolve_episode(_grouping(selectors), item).weights
-    return Items({"selector": pl.Series([visible(text) for text in selectors], dtype=pl.String)}, weights)
+    names = pl.Series([visible(text) for text in selectors], dtype=pl.String)
+    return Items({"selector": names}, weights, absent=absent)
 
 
 def _arrays(

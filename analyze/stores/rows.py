@@ -76,7 +76,7 @@ def layer_rows(
     name, recording, layout = f"{site}/rows", root.recording_of(site), root.site(site)
     every = range(layout.num_keys)
     keys = every if keys is None else keys
-    sums = episode.read(f"{site}/row_sum") if keys == every else _sums_of_segments(episode, layout, keys)
+    sums = episode.read_once(f"{site}/row_sum") if keys == every else _sums_of_segments(episode, layout, keys)
     # A slice where it can be one: picking heads by their numbers copies every row.
     replans, *_, stored, queries, _ = episode.shape_of(name)
     heads = slice(None) if selection.heads == tuple(range(stored)) else list(selection.heads)
@@ -112,7 +112,7 @@ def _sums_of_segments(episode: StoredEpisode, layout: SiteLayout, keys: range) -
     """What rows of the keys of whole spans add up to, from the stored masses: (replan, layer, denoise, head, query)."""
     inside = {span.name for span in layout.spans if span.start >= keys.start and span.stop <= keys.stop}
     segments = [i for i, one in enumerate(episode.attributes.segments[layout.name]) if one.span in inside]
-    masses = episode.read(f"{layout.name}/atoms")[..., segments]
+    masses = episode.read_once(f"{layout.name}/atoms")[..., segments]
     return np.asarray(masses.sum(axis=-1, dtype=np.float64), np.float32)
 
 

@@ -20,6 +20,7 @@ import json
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import product
 from typing import Any, TypeAlias
 
@@ -88,7 +89,11 @@ class Answers:
 
         An error is its sentence, as the server sends it. heads: with the rows of every head, which is most of it.
         """
-        for address in _addresses(self._shown(served.store, name), heads):
+        shown = self._shown(served.store, name)
+        for site in shown.store.attributes.sites:
+            with suppress(UserError):  # each answer says what is wrong with it
+                shown.read_ahead(site.name, heads)
+        for address in _addresses(shown, heads):
             try:
                 content, _ = self.answer([served], ("runs", "0", name, *address.split("/")), {})
             except UserError as error:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import io
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +24,15 @@ from vla_attention.analyze.core.action_changes import GRIPPER, ActionUnits
 from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.core.measure import means
-from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects
+from vla_attention.analyze.core.measure import Measured, look_at, means
+from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects, selected_items
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan, resolve_episode
-from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.rows import LayerRows, layer_rows
 from vla_attention.analyze.stores.run_notes import same_words, told_instruction
 from vla_attention.analyze.stores.selection import Selection, select
 from vla_attention.analyze.view.run_answers import episode_line
@@ -61,6 +64,9 @@ class ShownEpisode:
     _questions: dict[AnalysisSettings, Question] = field(default_factory=dict)
     #: By site the rows of the mean of all layers, for which every layer is read.
     _mean_rows: dict[str, Array] = field(default_factory=dict)
+    #: By site the rows of every layer, where all of them were read ahead; and by selector what heads look at.
+    _read: dict[str, dict[tuple[int, int], Array]] = field(default_factory=dict)
+    _grids: dict[str, dict[str, dict[str, Any]]] = field(default_factory=dict)
     #: By site what `covered` gave: heads and pictures ask for it, too.
     _covered: dict[str, dict[str, Any]] = field(default_factory=dict)
 
@@ -216,15 +222,31 @@ class ShownEpisode:
             return self._mean_rows[site]
         selection = replace(self._selection(site, layer), per_head=heads)
         parts: list[Array] = [np.zeros(())] * len(selection.denoise)
-        for part in layer_rows(self.store.attributes, self.episode, selection, site):
+        for part in self._layer_rows(site, selection):
             if part.layer in selection.once:
-                parts[part.denoise] = parts[part.denoise] + part.rows.astype(np.float64)
+                parts[part.denoise] = parts[part.denoise] + part.of_heads(heads).astype(np.float64)
         rows = np.stack(parts, axis=1) / len(selection.once)
         if heads:
             return rows
         if layer == MEAN:
             self._mean_rows[site] = rows[:, :, 0]
         return rows[:, :, 0]
+
+    def _layer_rows(self, site: str, selection: Selection) -> Iterator[LayerRows]:
+        if site not in self._read:
+            yield from layer_rows(self.store.attributes, self.episode, selection, site)
+            return
+        for i, j in product(range(len(selection.layers)), range(len(selection.denoise))):
+            rows = self._read[site][selection.layers[i], selection.denoise[j]]
+            yield LayerRows(i, j, range(rows.shape[-1]), rows)
+
+    def read_ahead(self, site: str, heads: bool) -> None:
+        """Read all layers and what all heads look at, for who asks for all of it: each chunk is decoded once."""
+        question = self.question(site)
+        rows = Look("rows", _KeptRows, heads, lambda _position, kept: kept)
+        (kept, grids) = scan(question, [rows, self._look_at_targets(site)])
+        self._read[site] = kept[0]
+        self._grids[site] = self._grid_of(site, grids[0])
 
     def uniform(self, site: str, layer: str) -> Array:
         """What uniform attention gives in the place of `rows`, (replan or 1, denoise or 1, key)."""
@@ -288,16 +310,25 @@ class ShownEpisode:
 
     def grid(self, site: str, selector: str) -> dict[str, Any]:
         """`grid.json`: mass and lift of a selector's keys in every head, (replan, layer, head)."""
+        if selector in [target["selector"] for target in self.targets(site)]:
+            if site not in self._grids:
+                ((measured,),) = scan(self.question(site), [self._look_at_targets(site)])
+                self._grids[site] = self._grid_of(site, measured)
+            return self._grids[site][selector]
         question = self.question(site, groups=(f"own={selector}",))
-        levels = levels_of(question, heads=True)
-        frame = pl.concat(means(one, ("replan", "layer", "head")) for one in levels.measured)
-        frame = frame.filter(pl.col("group") == "own", pl.col("layer") != LAYERS_AVG)
-        shape = (self.episode.attributes.num_replans, len(question.selection.layers), len(question.selection.heads))
-        return {
-            "layers": list(question.selection.layer_labels),
-            "heads": list(question.selection.head_numbers),
-            **{name: _numbers(frame[name].to_numpy().reshape(shape), exact=True) for name in ("mass", "lift")},
-        }
+        (measured,) = levels_of(question, heads=True).measured
+        return _grid(question, means(measured, ("replan", "layer", "head")).filter(group="own"))
+
+    def _look_at_targets(self, site: str) -> Look[Measured]:
+        selectors = tuple(target["selector"] for target in self.targets(site))
+        return look_at(self.question(site), partial(selected_items, selectors=selectors, absent="zero"), ("head",))
+
+    def _grid_of(self, site: str, measured: Measured) -> dict[str, dict[str, Any]]:
+        frame, question = means(measured, ("replan", "layer", "head")), self.question(site)
+        targets = [target["selector"] for target in self.targets(site)]
+        # Items follow each other in every cell.
+        of_items = (frame.gather_every(len(targets), i) for i in range(len(targets)))
+        return {selector: _grid(question, rows) for selector, rows in zip(targets, of_items, strict=True)}
 
     def keys(self, site: str, selector: str) -> dict[str, Any]:
         """`keys.json`: the keys that a selector takes with their weights, once where they never change, by replan."""
@@ -352,6 +383,35 @@ class ShownEpisode:
         change = self.episode.read(CHANGE)[entries].astype(np.float64) * np.array(effects.units)
         changed[replans] = actions[replans] + change
         return changed
+
+
+class _KeptRows:
+    """The rows of an episode by layer and denoise step (positions), (replan, head or 1, key) each."""
+
+    def __init__(self, item: SelectedEpisode, selection: Selection, _site: str, _given: None) -> None:
+        self.keys: range | None = range(item.tokens.layout.num_keys)
+        self.places = selection.layers, selection.denoise
+        self.rows: dict[tuple[int, int], Array] = {}
+
+    def add(self, part: LayerRows) -> None:
+        """Keep the rows of a layer."""
+        layers, steps = self.places
+        self.rows[layers[part.layer], steps[part.denoise]] = part.rows.copy()
+
+    def content(self) -> dict[tuple[int, int], Array]:
+        """What was kept."""
+        return self.rows
+
+
+def _grid(question: Question, rows: pl.DataFrame) -> dict[str, Any]:
+    """Of the rows of one item by replan, layer and head."""
+    rows, selection = rows.filter(pl.col("layer") != LAYERS_AVG), question.selection
+    shape = (-1, len(selection.layers), len(selection.heads))
+    return {
+        "layers": list(selection.layer_labels),
+        "heads": list(selection.head_numbers),
+        **{name: _numbers(rows[name].to_numpy().reshape(shape), exact=True) for name in ("mass", "lift")},
+    }
 
 
 def _quoted(name: str) -> str:

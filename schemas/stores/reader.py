@@ -150,6 +150,10 @@ class StoredEpisode:
     def _arrays(self) -> dict[str, StoredArray]:
         return {}
 
+    @cached_property
+    def _once(self) -> dict[str, NDArray[Any]]:
+        return {}
+
     def has(self, name: str) -> bool:
         """Whether the episode has an array of that name, or numbers of that name in its attributes."""
         return name in self.attributes.arrays or bool(self._numbers_of(name))
@@ -198,6 +202,12 @@ class StoredEpisode:
         chosen = indices[index] if isinstance(index, slice) else range(indices[index], indices[index] + 1)
         values = self.values_of(name, self.read_stored(name, chosen.start, chosen.stop))
         return values[0] if isinstance(index, int) else values
+
+    def read_once(self, name: str) -> NDArray[Any]:
+        """As `read`, of a small array that several need; kept as long as this object lives, and not to be changed."""
+        if name not in self._once:
+            self._once[name] = self.read(name)
+        return self._once[name]
 
     def read_stored(self, name: str, first: int, stop: int) -> NDArray[Any]:
         """Numbers of one array as they are stored, from one index along the first axis to another; see `values_of`."""

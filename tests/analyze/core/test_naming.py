@@ -25,14 +25,28 @@ from benchmarks.null_objects import (
 from tests.kit.made_up_behaviour import COLOURS
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import probabilities
-from vla_attention.analyze.core.naming import ALL_NAMED, by_kind, differences, naming, told_things
-from vla_attention.analyze.core.object_shares import with_coverage
+from vla_attention.analyze.core.naming import (
+    ALL_NAMED,
+    Naming,
+    ObjectAttention,
+    by_kind,
+    differences,
+    naming,
+    told_things,
+)
+from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.episode_steps import EpisodeSteps
 
 
 @pytest.fixture(scope="module")
 def cubes():
     return scenes_of(va.example("cubes"))
+
+
+def naming_of(question: Question) -> Naming:
+    objects = ObjectAttention.measured_in(question)
+    assert objects is not None
+    return naming(objects.question, objects.measured, objects.maps)
 
 
 def named_twice(cubes, path: Path, times: float, states: bool = True) -> Path:
@@ -68,7 +82,7 @@ def test_the_same_object_in_the_same_state_equals_a_loop_over_raw_rows():
         others = [one[2][named] for one in episodes.values() if one[0] == state and one[1] != named]
         assert len(others) == 2
         logs[key] = np.log(share[named]) - np.log(others).mean()
-    found = naming(with_coverage(question_about(path)))
+    found = naming_of(question_about(path))
     assert found.form == "same state"
     assert found.answer["ratio"] == pytest.approx(np.exp(np.mean(list(logs.values()))), rel=1e-3)
     own = {(task, episode): log for _, task, episode, log in found.episodes.iter_rows()}
@@ -91,7 +105,7 @@ def test_the_same_object_in_other_tasks_equals_a_loop_over_raw_rows(cubes, tmp_p
     for (task, _), values, (_, named, *_) in zip(over, over.values(), episodes.values(), strict=True):
         others = [np.mean([over[other, i][named] for i in (0, 1)]) for other in (0, 1, 2) if other != task]
         logs.append(values[named] - np.mean(others))
-    found = naming(with_coverage(question_about(path)))
+    found = naming_of(question_about(path))
     assert found.form == "other tasks"
     assert found.answer["ratio"] == pytest.approx(np.exp(np.mean(logs)), rel=1e-3)
     assert set(found.rows.filter(camera="all")["item"]) == {ALL_NAMED, *(f"{c}_cube" for c in ("red", "green", "blue"))}
@@ -125,7 +139,7 @@ def test_a_kind_that_is_always_named_makes_no_claim(tmp_path):
     root, scenes = like_libero("spatial", 0)
     scenes = [scene for scene in scenes if scene.start.task_id < 3]
     path = write(tmp_path / "a.zarr", root, scenes, [rows_of(one, root, FOLLOWS["uniform"], 0, 9.0) for one in scenes])
-    found = naming(with_coverage(question_about(path)))
+    found = naming_of(question_about(path))
     assert (found.form, found.always) == (None, ("black_bowl", "plate"))
     assert not claims(path)
 
