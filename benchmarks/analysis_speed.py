@@ -1,4 +1,4 @@
-"""Time, bytes and memory of an analysis, beside only decoding the same chunks, zarr-python, and xarray with dask.
+"""Time, bytes and memory of an analysis, beside only decoding its chunks, other readers, and an earlier form of rows.
 
 Usage: OMP_NUM_THREADS=2 python benchmarks/analysis_speed.py [--store PATH] [--episodes 50] [--parts scan ...]
 
@@ -7,8 +7,14 @@ first and last denoise step, 978 keys, rows averaged over the queries, made-up r
 measures goes to benchmarks/rows/analysis_speed.json; nothing is asserted. The parts:
 
     scan       in one process, in turn, with OMP_NUM_THREADS threads: decoding every chunk of the rows (read, crc32c,
-               Blosc) and nothing else; masses of words; the whole question from opening the store to tables with
-               intervals; the same masses by a loop with zarr-python, and by xarray with dask (`pip install dask`)
+               Blosc) and nothing else, and a bare loop to the masses of words, both of the rows as they are stored and
+               in the form of earlier stores (row_forms.py); the bare loop over the chunks that hold the text alone;
+               masses of words as the package computes them; the whole question from opening the store to tables with
+               intervals; masses of as many groups by a loop with zarr-python, by one with tensorstore, and by xarray
+               with dask (the last two where they are installed). Ratios are to the bare loop over the earlier form
+    chunks     what chunks of keys change in the layouts of several policies: bytes, reads and time for all keys and for
+               those of the text, beside one chunk for all keys; made-up rows
+    bits       bytes and time of a number by mantissa bits
     bytes      what the process reads for all layers and for three of eighteen, as Linux counts it
     processes  whole `vla-attention analyze` processes without the cache: wall seconds and peak memory
     memory     peak memory of whole processes by number of episodes (--sizes 50 500, each a multiple of the first),
@@ -19,7 +25,7 @@ measures goes to benchmarks/rows/analysis_speed.json; nothing is asserted. The p
 from __future__ import annotations
 
 import argparse
-import math
+import json
 import os
 import re
 import shutil
@@ -27,25 +33,31 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from measurement import ROOT, Table, in_turn, measured, ratios, run_process, write_rows
+from measurement import ROOT, ROWS, Table, in_turn, measured, ratios, run_process, write_rows
 from repeated_store import repeat_store
 
 sys.path.insert(0, str(ROOT))
 
 import numpy as np
+from row_forms import ChunkFile, Wanted, measure_bits, measure_chunks, old_chunks, stored_chunks, stored_layers
 
-from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.levels import items_of, levels_of
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.schemas.stores.reader import StoredEpisode, open_store
+from vla_attention.analyze.stores.parallel import one_blas_thread
+from vla_attention.schemas.stores.reader import open_store
 
+Item = TypeVar("Item")
+#: The row of the part `scan` that the others are compared with.
+OLD_SCAN = "old form: scan of masses with checksums and row sums"
 WORDS = ("--group", "soup=word:soup", "--group", "v=role:image", "--ratio", "v/soup")
 SETTINGS = AnalysisSettings(groups=("soup=word:soup", "v=role:image"), ratio="v/soup")
 #: The command of each row of the part `processes`, after `vla-attention analyze STORE`.
@@ -92,34 +104,56 @@ def made(path: Path, episodes: int, replans: int, heads: int = 8) -> Path:
     return path
 
 
-def decode_only(store: Path, threads: int) -> Callable[[], None]:
-    """Read and decode every chunk of the rows, into memory that is used again; the positions are read beforehand."""
-    from vla_attention.schemas.stores.digest import crc32c
+def of_episodes(function: Callable[[Item], object], items: Iterable[Item], threads: int) -> None:
+    """Call a function with each, in so many threads; results are let go."""
+    with one_blas_thread(), ThreadPoolExecutor(threads) as executor:
+        for _ in executor.map(function, items):
+            pass
 
-    def positions(episode: StoredEpisode) -> tuple[Path, list[tuple[int, int]], int]:
-        about = episode.array("joint/rows").metadata
-        path = episode.folder / "joint/rows" / about.file
-        index = np.frombuffer(path.read_bytes()[-16 * about.shard_chunks - 4 : -4], "<u8").reshape(-1, 2)
-        return path, [(at, size - 4) for at, size in index.tolist()], math.prod(about.chunk_shape)
 
-    def decode(of_episode: tuple[Path, list[tuple[int, int]], int]) -> None:
-        from numcodecs import blosc
+def decode(file: ChunkFile) -> None:
+    """Read and decode every chunk, into memory that is used again; where they are is known."""
+    for _ in file.chunks():
+        pass
 
-        path, places, numbers = of_episode
-        memory = np.empty(numbers, np.float32)
-        with path.open("rb", buffering=0) as file:
-            for at, size in places:
-                frame = os.pread(file.fileno(), size, at)
-                crc32c(frame)
-                blosc.decompress(frame, memory)
 
-    known = [positions(episode) for episode in open_store(store).episodes]
+@dataclass(frozen=True)
+class BareLoops:
+    """The least that the masses of a question take: groups are resolved and places of chunks read beforehand.
 
-    def run() -> None:
-        with ThreadPoolExecutor(threads) as executor:
-            list(executor.map(decode, known))
+    Attributes:
+        old, stored: the chunks of each episode, in the form of earlier stores and as they are.
+        calls: of the rows of `measure_scan`: bare loops over both, and over the chunks that hold the text.
+    """
 
-    return run
+    old: list[ChunkFile]
+    stored: list[ChunkFile]
+    calls: Mapping[str, Callable[[], None]]
+
+    @classmethod
+    def of(cls, store: Path, scratch: Path, threads: int) -> BareLoops:
+        """Write the earlier form of a store's rows into an empty folder, and read what the loops need."""
+        question = ask([open_store(store)], SETTINGS)
+        arrays, wanted = [], []
+        for item in question.selected:
+            row_sum = item.episode.read("joint/row_sum").mean(axis=(-2, -1))  # (replan, layer, denoise)
+            weights = items_of(item, question.grouping).with_totals(item)
+            wanted.append(Wanted(weights, row_sum.reshape(len(row_sum), -1).T))
+            arrays.append(item.episode.array("joint/rows"))
+        text = question.selected[0].tokens.layout.span("prompt")
+        keys = arrays[0].metadata.whole_chunks(text.start, text.stop)
+        of_text = [one.of_keys(keys) for one in wanted]
+        old = [old_chunks(item.episode, scratch / f"{i}.old") for i, item in enumerate(question.selected)]
+        stored = [stored_chunks(item.episode) for item in question.selected]
+        every = range(len(arrays))
+        loops: dict[str, Callable[[int], object]] = {
+            OLD_SCAN: lambda i: wanted[i].masses(old[i].chunks()),
+            "the same loop over the rows as they are stored": lambda i: wanted[i].masses(stored_layers(arrays[i])),
+            "masses of words from the chunk of the text keys alone, the same loop": lambda i: of_text[i].masses(
+                stored_layers(arrays[i], keys)
+            ),
+        }
+        return cls(old, stored, {name: partial(of_episodes, loop, every, threads) for name, loop in loops.items()})
 
 
 def scan_of(store: Path) -> Callable[[], None]:
@@ -135,15 +169,40 @@ def whole_question(store: Path) -> None:
     analyze(ask([open_store(store)], SETTINGS))
 
 
-def zarr_loop(store: Path, weights: np.ndarray[Any, Any]) -> None:
-    """Masses of as many groups, a layer and denoise step at a time."""
-    import zarr
+def loop_over(open_rows: Callable[[Path], Any], store: Path, weights: np.ndarray[Any, Any]) -> None:
+    """Masses of as many groups, a layer and denoise step at a time.
 
+    open_rows: opens the array in a folder, of which (replan, head, query, key) are asked for.
+    """
     for episode in sorted(Path(store, "episodes").glob("task*")):
-        rows: Any = zarr.open_array(episode / "joint/rows", mode="r")
+        folder = episode / "joint/rows"
+        rows = open_rows(folder)
+        attributes = json.loads((folder / "zarr.json").read_bytes()).get("attributes", {})
+        scaled = weights * np.float32(attributes.get("scale_factor", 1))
         for layer in range(rows.shape[1]):
             for denoise in range(rows.shape[2]):
-                rows[:, layer, denoise].mean(axis=(1, 2)) @ weights
+                np.asarray(rows[:, layer, denoise]).astype(np.float32).mean(axis=(1, 2)) @ scaled
+
+
+def zarr_loop(store: Path, weights: np.ndarray[Any, Any]) -> None:
+    """The loop with zarr-python."""
+    import zarr
+
+    loop_over(lambda folder: zarr.open_array(folder, mode="r"), store, weights)
+
+
+def tensorstore_loop(store: Path, weights: np.ndarray[Any, Any], threads: int) -> None:
+    """The loop with tensorstore, which reads when numpy asks for an array."""
+    import tensorstore
+
+    limits = {"data_copy_concurrency": {"limit": threads}, "file_io_concurrency": {"limit": threads}}
+    context = tensorstore.Context(limits)
+
+    def open_rows(folder: Path) -> Any:
+        place = {"driver": "zarr3", "kvstore": {"driver": "file", "path": f"{folder}/"}}
+        return tensorstore.open(place, context=context, open=True, read=True).result()
+
+    loop_over(open_rows, store, weights)
 
 
 def xarray_dask(store: Path, weights: np.ndarray[Any, Any], threads: int) -> None:
@@ -158,16 +217,21 @@ def xarray_dask(store: Path, weights: np.ndarray[Any, Any], threads: int) -> Non
             data["rows"].mean(("head", "query")).dot(named, dim="key").compute()
 
 
-def measure_scan(store: Path, rounds: int, threads: int) -> Table:
+def measure_scan(store: Path, scratch: Path, rounds: int, threads: int) -> Table:
     """The part `scan`."""
     weights = np.random.default_rng(0).random((978, 3)).astype(np.float32)
-    decode, scan = "decoding alone", "masses of words (scan)"
+    bare = BareLoops.of(store, scratch, threads)
     calls: dict[str, Callable[[], object]] = {
-        decode: decode_only(store, threads),
-        scan: scan_of(store),
+        "old form: decoding alone": lambda: of_episodes(decode, bare.old, threads),
+        OLD_SCAN: bare.calls[OLD_SCAN],
+        "decoding alone": lambda: of_episodes(decode, bare.stored, threads),
+        **bare.calls,
+        "masses of words (scan)": scan_of(store),
         "the whole question: open, resolve, scan, tables with intervals": lambda: whole_question(store),
         "a loop with zarr-python: masses alone": lambda: zarr_loop(store, weights),
     }
+    if find_spec("tensorstore") is not None:
+        calls["a loop with tensorstore: masses alone"] = lambda: tensorstore_loop(store, weights, threads)
     if find_spec("dask") is not None:
         calls["xarray and dask: masses alone"] = lambda: xarray_dask(store, weights, threads)
     wall: dict[str, list[float]] = {name: [] for name in calls}
@@ -181,27 +245,30 @@ def measure_scan(store: Path, rounds: int, threads: int) -> Table:
     processor = in_turn({name: partial(measurer, name) for name in calls}, rounds)
     # The first of each is the warm-up's.
     wall = {name: values[1:] for name, values in wall.items()}
+    count = len(bare.stored)
     rows = [
         {
             "what": name,
             "seconds": measured(wall[name]),
-            "times": measured(ratios(wall[name], wall[decode])),
-            "processor": measured(processor[name]),
-            "processor_times": measured(ratios(processor[name], processor[decode])),
-            "of_scan": measured(ratios(wall[name], wall[scan])),
+            "seconds_times": measured(ratios(wall[name], wall[OLD_SCAN])),
+            "processor": measured(processor[name], factor=1000 / count),
+            "processor_times": measured(ratios(processor[name], processor[OLD_SCAN])),
         }
         for name in calls
     ]
     columns = {
         "what": "what",
         "seconds": "seconds",
-        "times": "times decoding",
-        "processor": "processor's seconds",
-        "processor_times": "times decoding's",
-        "of_scan": "seconds, times the scan",
+        "seconds_times": "times the old form's scan",
+        "processor": "processor's ms an episode",
+        "processor_times": "times the old form's scan's",
     }
-    count = len(open_store(store).episodes)
-    return Table(columns, rows, f"{count} episodes, {threads} threads; ratios are of the same round.")
+    sizes = [sum(file.path.stat().st_size for file in files) / count / 1e6 for files in (bare.stored, bare.old)]
+    note = (
+        f"{count} episodes, {threads} {'thread' if threads == 1 else 'threads'}; ratios are of the same round. Rows of "
+        f"an episode take {sizes[0]:.1f} MB, in the old form {sizes[1]:.1f} MB."
+    )
+    return Table(columns, rows, note)
 
 
 def measure_bytes(store: Path) -> Table:
@@ -275,7 +342,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--sizes", type=int, nargs="+", default=[50, 500], help="episodes of memory and masses")
     parser.add_argument("--only", default="", metavar="TEXT", help="of memory, the commands whose name has this text")
-    parser.add_argument("--parts", nargs="+", default=["scan", "bytes", "processes"])
+    parser.add_argument("--rows", type=Path, metavar="FOLDER", help="of the file of rows (default: benchmarks/rows)")
+    parser.add_argument("--parts", nargs="+", default=["scan", "chunks", "bits", "bytes", "processes"])
     arguments = parser.parse_args()
     os.environ["VLA_CACHE"] = "off"  # an analysis that was made before is not measured
     threads = int(os.environ.get("OMP_NUM_THREADS", "2"))
@@ -285,11 +353,17 @@ def main() -> None:
         store = made(arguments.store or scratch / "store.zarr", arguments.episodes, arguments.replans)
         name = f"_{arguments.episodes}"
         if "scan" in arguments.parts:
-            tables[f"scan{name}"] = measure_scan(store, arguments.rounds, threads)
+            old = Path(tempfile.mkdtemp(dir=scratch))
+            tables[f"scan{name}"] = measure_scan(store, old, arguments.rounds, threads)
+            shutil.rmtree(old)
         if "bytes" in arguments.parts:
             tables["bytes"] = measure_bytes(store)
         if "processes" in arguments.parts:
             tables["processes"] = measure_processes([store], 3, {kind: ((), given) for kind, given in COMMANDS.items()})
+    if "chunks" in arguments.parts:
+        tables["chunks"] = measure_chunks(Path(tempfile.mkdtemp(dir=scratch)), arguments.rounds)
+    if "bits" in arguments.parts:
+        tables["bits"] = measure_bits(Path(tempfile.mkdtemp(dir=scratch)), arguments.rounds)
     if {"memory", "masses"} & set(arguments.parts):
         first, *further = arguments.sizes
         stores = [made(scratch / f"{first} episodes.zarr", first, arguments.replans)]
@@ -307,7 +381,7 @@ def main() -> None:
     if arguments.only:
         given += ["--only", f"'{arguments.only}'"]
     command = " ".join([f"OMP_NUM_THREADS={threads} python benchmarks/analysis_speed.py", *given])
-    print(write_rows("analysis_speed", tables, command=command))
+    print(write_rows("analysis_speed", tables, command=command, folder=arguments.rows or ROWS))
     for table_name, table in tables.items():
         print(table_name, *table.rows, table.note, sep="\n  ")
 

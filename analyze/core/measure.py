@@ -220,7 +220,7 @@ class _ItemMasses:
         tokens, segments = item.tokens, item.episode.attributes.segments[site]
         members = segment_members(tokens.layout, tokens.static_roles, segments)
         self.of_segments, cut = weights_on_segments(self.weights, members)
-        self.cut = cut.any(axis=0)
+        self.cut = np.asarray(cut.any(axis=0))
         atoms = _selected_cells(item.episode.read_once(f"{site}/atoms"), selection).mean(axis=-2)
         self.atoms = atoms if selection.per_head else atoms.mean(axis=3, keepdims=True)
         # The parts of segments that items take, then the segments whole.
