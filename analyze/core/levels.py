@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.estimate import estimate
-from vla_attention.analyze.core.measure import Items, Measured, look_at, table_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.core.measure import Items, Measured, averaged, axes_of, look_at, table_of
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG, frame_of_episodes, long_table
+from vla_attention.analyze.measures.masses import finite_mean, ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_not_empty, resolve_episode
@@ -36,11 +37,10 @@ from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
 
+Array: TypeAlias = NDArray[np.float64]
 LAYER = ("layer", "layer_number", "block")
 SIDES = ("numerator", "denominator")
 _TASK = ("scope", "suite", "task_id", "instruction")
-#: What `measure.means` is asked for beside the items' numbers.
-MORE = ("row_sum", "valid", "num_valid", "uniform")
 _FRACTIONS = ("numerator_fraction", "denominator_fraction")
 
 
@@ -71,14 +71,15 @@ class Levels:
         times = self.measured[0].denoise_time.tolist()
         named = dict(zip(self.question.selection.denoise_steps, times, strict=True))
 
-        def then(rows: pl.DataFrame) -> pl.DataFrame:
-            cells = cells_of(rows.filter(pl.col("layer") != LAYERS_AVG), self.grouping).drop(_FRACTIONS, strict=False)
+        def then(cells: pl.DataFrame) -> pl.DataFrame:
+            cells = cells.filter(pl.col("layer") != LAYERS_AVG).drop(_FRACTIONS, strict=False)
             return cells.with_columns(
                 pl.col("layer_number").alias("layer"),
                 denoise_time=pl.col("denoise_step").replace_strict(named, return_dtype=pl.Float64),
             ).drop("layer_number")
 
-        return table_of(self.measured, OF_ROWS if self.heads else OF_ROWS[:3], MORE, then)
+        by = OF_ROWS if self.heads else OF_ROWS[:3]
+        return frame_of_episodes(self.measured, partial(cells_of, grouping=self.grouping, by=by), then)
 
     def steps_groups(self) -> pl.LazyFrame:
         """`groups` of every step; `layer` is a number."""
@@ -90,7 +91,7 @@ class Levels:
         numerator_mass, denominator_mass, uniform_ratio, ratio, ratio_mean, nonfinite_layers (1 where the ratio is not
         finite; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
         """
-        return table_of(self.measured, ("replan", "layer"), MORE, partial(replan_cells, grouping=self.grouping))
+        return frame_of_episodes(self.measured, partial(replan_cells, grouping=self.grouping))
 
     def groups(self, *by: str) -> pl.LazyFrame:
         """Keys, mass, density, lift and fraction of each group, kept apart by some of replan, layer, denoise, head."""
@@ -99,10 +100,8 @@ class Levels:
     def episodes(self) -> pl.DataFrame:
         """Over the episode's replans (see `over_replans`), sorted by suite, task, episode and layer."""
 
-        def then(rows: pl.DataFrame) -> pl.DataFrame:
-            return over_replans(replan_cells(rows, self.grouping))
-
-        return _sorted(table_of(self.measured, ("replan", "layer"), MORE, then).collect())
+        cells = partial(replan_cells, grouping=self.grouping)
+        return _sorted(frame_of_episodes(self.measured, cells, over_replans).collect())
 
     def episodes_groups(self) -> pl.DataFrame:
         """`EPISODE_ID`, layer, layer_number, block, group; mass, mass_std, fraction, fraction_std, keys, density, lift:
@@ -157,30 +156,86 @@ def _of_groups(rows: pl.DataFrame) -> pl.DataFrame:
     return rows.filter(pl.col("kind") == "group").drop("kind").rename(names)
 
 
-def cells_of(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
-    """The rows of `means` once a cell, with masses and fractions of both sides of the ratio, and the ratio."""
-    first = pl.col("kind") == SIDES[0] if grouping.ratio else pl.col("group") == grouping.names[0]
-    items = ("kind", "group", "keys", "mass", "density", "lift", "share", "uniform", "whole")
-    cells = rows.filter(first).rename({"valid": "valid_mass"})
+def cells_of(one: Measured, grouping: Grouping, by: Collection[str]) -> pl.DataFrame:
+    """The masses of both sides of the ratio and their ratio, in every replan and cell of the axes `by`.
+
+    Returns:
+        One row per cell: `EPISODE_KEYS`, replan, env_step, layer, layer_number, block (the layers, then "layers_avg"),
+        denoise_step, head, row_sum, valid_mass, num_valid; with a ratio numerator_mass, denominator_mass,
+        numerator_fraction, denominator_fraction, ratio, uniform_ratio, ratio_lift, log2_ratio.
+    """
+    by = {"replan", "layer", *by}
+    return long_table(one.item, axes_of(one, by), _cell_values(one, grouping, by), EPISODE_KEYS)
+
+
+def replan_cells(one: Measured, grouping: Grouping) -> pl.DataFrame:
+    """`Levels.replans` of an episode."""
+    by = {"replan", "layer"}
+    values = _cell_values(one, grouping, by)
+    if grouping.ratio is not None:
+        values |= _of_whole_replans(values["ratio"], values["uniform_ratio"], list(one.selection.once))
+        values = _relative(values)
+    fractions = ("numerator_fraction", "denominator_fraction")
+    table = long_table(one.item, axes_of(one, by), values, EPISODE_KEYS).drop("denoise_step", "head")
+    return table.drop(fractions, strict=False)
+
+
+def _cell_values(one: Measured, grouping: Grouping, by: Collection[str]) -> dict[str, NDArray[Any]]:
+    """Columns of `cells_of`, each (replan, layer, denoise, head)."""
+    found = averaged(one, by)
+    values: dict[str, NDArray[Any]] = {
+        "row_sum": found["row_sum"],
+        "valid_mass": found["valid"],
+        "num_valid": one.num_valid[:, None, None, None].astype(np.float64),
+    }
     if grouping.ratio is None:
-        return cells.drop(items, strict=False)
-    below = rows.filter(pl.col("kind") == SIDES[1])
-    above_mass, below_mass = cells["mass"], below["mass"]
-    sides = cells.drop(items, strict=False).with_columns(
-        numerator_mass=above_mass,
-        denominator_mass=below_mass,
-        numerator_fraction=cells["share"],
-        denominator_fraction=below["share"],
-        ratio=(above_mass / below_mass).fill_nan(None),
-        uniform_ratio=(cells["uniform"] / below["uniform"]).fill_nan(None),
-    )
-    return sides.with_columns(*_relative())
+        return values
+    first = len(grouping.names)  # behind the groups, both sides of the ratio
+    for i, side in enumerate(SIDES, first):
+        mass = found["mass"][..., i]
+        values |= {f"{side}_mass": mass, f"{side}_fraction": ratio(mass, found["whole"])}
+    values["ratio"] = ratio(values["numerator_mass"], values["denominator_mass"])
+    even = ratio(found["uniform"][..., first], found["uniform"][..., first + 1])
+    return _relative(values | {"uniform_ratio": np.broadcast_to(even, values["ratio"].shape)})
 
 
-def _relative() -> list[pl.Expr]:
-    """`ratio_lift`, the ratio / the uniform ratio, and `log2_ratio`."""
-    lift = (pl.col("ratio") / pl.col("uniform_ratio")).fill_nan(None).alias("ratio_lift")
-    return [lift, pl.col("ratio").log(2.0).fill_nan(None).alias("log2_ratio")]
+def _relative(values: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The values with `ratio_lift`, the ratio / the uniform ratio, and `log2_ratio`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log2(values["ratio"])
+    return values | {"ratio_lift": ratio(values["ratio"], values["uniform_ratio"]), "log2_ratio": logs}
+
+
+def _of_whole_replans(ratios: Array, uniform: Array, once: list[int]) -> dict[str, NDArray[Any]]:
+    """Ratios (replan, layer and their mean, 1, 1) with what "layers_avg" says of the layers' ratios.
+
+    Geometric means are over layers whose ratio has a finite logarithm, and so is that of the uniform ratios, unless
+    these are all the same. once: layers; a block that two layer numbers name counts once.
+    """
+    layers, even = ratios[:, once], uniform[:, once]
+    finite = np.isfinite(layers)
+    has_log = finite & (layers > 0)
+    counted = has_log | ~has_log.any(axis=1, keepdims=True)
+    one = np.where((even == even[:, :1]).all(axis=1), even[:, 0], _geometric_mean(even, counted))
+    nonfinite = (~np.isfinite(ratios)).astype(np.int64)
+    nonfinite[:, -1] = (~finite).sum(axis=1)
+
+    def joined(of_layers: Array, average: Array) -> Array:
+        return np.concatenate([of_layers[:, :-1], average[:, None]], axis=1)
+
+    return {
+        "ratio": joined(ratios, _geometric_mean(layers, has_log)),
+        "ratio_mean": joined(ratios, finite_mean(layers, 1)),
+        "uniform_ratio": joined(uniform, one),
+        "nonfinite_layers": nonfinite,
+    }
+
+
+def _geometric_mean(values: Array, which: NDArray[np.bool_]) -> Array:
+    """exp of the mean of the logarithms of positive finite values among `which`, along axis 1; NaN without any."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(np.where(which & np.isfinite(values) & (values > 0), values, np.nan))
+    return np.exp(finite_mean(logs, 1))
 
 
 def _finite(name: str) -> pl.Expr:
@@ -204,37 +259,6 @@ def _geometric(name: str) -> pl.Expr:
     return pl.col(name).filter(pl.col(name).is_finite() & (pl.col(name) > 0)).log().mean().exp()
 
 
-def replan_cells(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
-    """`Levels.replans` from the rows of `means` by replan and layer, of whole replans."""
-    cells = cells_of(rows, grouping).drop("denoise_step", "head", *_FRACTIONS, strict=False)
-    if grouping.ratio is None:
-        return cells
-    known = pl.col("ratio").is_finite().fill_null(False)
-    cells = cells.with_columns(ratio_mean="ratio", nonfinite_layers=(~known).cast(pl.Int64))
-    layers = cells.filter(pl.col("layer") != LAYERS_AVG)
-    # A block that two layer numbers name counts once.
-    once = layers.unique([*EPISODE_ID, "replan", "block"], keep="first", maintain_order=True)
-    has_log = known & (pl.col("ratio") > 0)
-    counted = pl.col("uniform_ratio").filter(has_log | ~has_log.any())
-    same = pl.col("uniform_ratio").n_unique() == 1
-    average = once.group_by(*EPISODE_ID, "replan", maintain_order=True).agg(
-        _geometric("ratio").alias("ratio"),
-        _finite("ratio").mean().alias("ratio_mean"),
-        _num_without("ratio").alias("nonfinite_layers"),
-        pl.when(same)
-        .then(pl.col("uniform_ratio").first())
-        .otherwise(counted.filter(counted.is_finite() & (counted > 0)).log().mean().exp())
-        .alias("uniform_ratio"),
-    )
-    whole = (
-        cells.filter(pl.col("layer") == LAYERS_AVG)
-        .drop("ratio", "ratio_mean", "nonfinite_layers", "uniform_ratio")
-        .join(average, on=[*EPISODE_ID, "replan"], how="left", maintain_order="left")
-    )
-    joined = pl.concat([layers, whole.with_columns(*_relative()).select(layers.columns)])
-    return joined.sort(*EPISODE_ID, "replan", "layer_number", nulls_last=True, maintain_order=True)
-
-
 def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
     """The ratio of every episode and cell of the axes; the grouping has one.
 
@@ -244,8 +268,8 @@ def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
         numerator_mass, denominator_mass (means), num_nonfinite (ratios without a finite logarithm).
     """
 
-    def then(rows: pl.DataFrame) -> pl.DataFrame:
-        cells = cells_of(rows, levels.grouping).filter(pl.col("layer") != LAYERS_AVG)
+    def then(cells: pl.DataFrame) -> pl.DataFrame:
+        cells = cells.filter(pl.col("layer") != LAYERS_AVG)
         if "layer" not in by:  # a block that two layer numbers name counts once
             cell = [*EPISODE_ID, "replan", "block", "denoise_step", "head"]
             cells = cells.unique(cell, keep="first", maintain_order=True)
@@ -258,8 +282,8 @@ def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
             (~logs["ratio"].is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
         )
 
-    inner = {"replan", "layer", *(axis for axis in OF_ROWS if axis in by)}
-    return table_of(levels.measured, inner, MORE, then).collect()
+    cells_of_axes = partial(cells_of, grouping=levels.grouping, by=[axis for axis in OF_ROWS if axis in by])
+    return frame_of_episodes(levels.measured, cells_of_axes, then).collect()
 
 
 def groups_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:

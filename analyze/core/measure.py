@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
+    Axis,
     frame_of_episodes,
     head_axis,
     layer_axis,
@@ -285,6 +286,44 @@ def _selected_cells(values: NDArray[np.float32], selection: Selection) -> NDArra
     return values[:, list(selection.layers)][:, :, list(selection.denoise)][:, :, :, list(selection.heads)]
 
 
+def averaged(one: Measured, by: Collection[str] = ()) -> dict[str, Array]:
+    """The masses of an episode, means over the axes that are not in `by`; the replans are kept.
+
+    Returns:
+        mass and uniform, (replan, layer, denoise or 1, head or 1, item); whole, valid, row_sum and uniform_valid,
+        without the items. The layers are those of the selection, then their mean; without "layer" the latter alone. An
+        axis along which uniform attention does not change may have length 1.
+    """
+    selection = one.selection
+    for axis, name, labels in ((2, "denoise", selection.denoise), (3, "head", selection.heads)):
+        if name in by and one.mass.shape[axis] < len(labels):
+            raise ValueError(f"the axis '{name}' was not kept when the items were measured")
+    gone = tuple(axis for axis, name in ((2, "denoise"), (3, "head")) if name not in by)
+
+    def of_layers(values: Array) -> Array:
+        values = values.mean(axis=gone, keepdims=True)
+        if values.shape[1] == 1 and len(selection.layers) > 1:  # the same in all layers
+            return values
+        average: Array = values[:, list(selection.once)].mean(axis=1, keepdims=True)
+        return np.concatenate([values, average], axis=1) if "layer" in by else average
+
+    names = ("mass", "uniform", "whole", "valid", "row_sum", "uniform_valid")
+    return {name: of_layers(getattr(one, name)) for name in names}
+
+
+def axes_of(one: Measured, by: Collection[str] = ()) -> list[Axis]:
+    """The labels of the axes of `averaged` but the items; without "replan" those behind it."""
+    selection, place = one.selection, slice(None) if "layer" in by else slice(-1, None)
+    axes: list[Axis] = [{"replan": range(len(one.env_step)), "env_step": one.env_step}] if "replan" in by else []
+    axes.append({name: list(labels)[place] for name, labels in layer_axis(selection).items()})
+    steps = selection.denoise_steps if "denoise" in by else [None]
+    return [
+        *axes,
+        {"denoise_step": pl.Series(steps, dtype=pl.Int64)},
+        head_axis(replace(selection, per_head="head" in by)),
+    ]
+
+
 def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = ()) -> pl.DataFrame:
     """Means over an episode's replans, or with "replan" the numbers of each.
 
@@ -302,22 +341,10 @@ def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = 
             share  mass / mass of `Items.whole`
         Null where a number does not exist.
     """
-    one, selection = measured, measured.selection
-    for axis, name, labels in ((2, "denoise", selection.denoise), (3, "head", selection.heads)):
-        if name in by and one.mass.shape[axis] < len(labels):
-            raise ValueError(f"the axis '{name}' was not kept when the items were measured")
-    averaged = tuple(axis for axis, name in ((2, "denoise"), (3, "head")) if name not in by)
-
-    def of_layers(values: Array) -> Array:
-        values = values.mean(axis=averaged, keepdims=True)
-        if values.shape[1] == 1 and len(selection.layers) > 1:  # the same in all layers
-            return values
-        average: Array = values[:, list(selection.once)].mean(axis=1, keepdims=True)
-        return np.concatenate([values, average], axis=1) if "layer" in by else average
-
-    mass, uniform = of_layers(one.mass), of_layers(one.uniform)
+    one, found = measured, averaged(measured, by)
+    mass, uniform = found["mass"], found["uniform"]
     whole, valid, row_sum, of_valid = (
-        of_layers(part)[..., None] for part in (one.whole, one.valid, one.row_sum, one.uniform_valid)
+        found[name][..., None] for name in ("whole", "valid", "row_sum", "uniform_valid")
     )
     keys = np.broadcast_to(one.keys[:, None, None, None], mass.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -338,19 +365,11 @@ def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = 
     if one.absent == "left out":
         values = {name: np.where(keys > 0, array, np.nan) for name, array in values.items()}
     spread = {name: values[name] for name in ("mass", "share") if f"{name}_std" in more}
-    axes: list[Any] = []
-    if "replan" in by:
-        axes.append({"replan": range(len(one.env_step)), "env_step": one.env_step})
-    else:
+    if "replan" not in by:
         values = {name: finite_mean(array) for name, array in values.items()}
         for name, array in spread.items():
             values[f"{name}_std"] = np.sqrt(finite_mean((array - values[name]) ** 2))
-    place = slice(None) if "layer" in by else slice(-1, None)
-    axes.append({name: list(labels)[place] for name, labels in layer_axis(selection).items()})
-    steps = selection.denoise_steps if "denoise" in by else [None]
-    axes.append({"denoise_step": pl.Series(steps, dtype=pl.Int64)})
-    axes.append(head_axis(replace(selection, per_head="head" in by)))
-    return long_table(one.item, [*axes, one.labels], values, EPISODE_KEYS)
+    return long_table(one.item, [*axes_of(one, by), one.labels], values, EPISODE_KEYS)
 
 
 def table_of(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from vla_attention.analyze.core.levels import MORE, Levels, replan_cells
+from vla_attention.analyze.core.levels import Levels, replan_cells
 from vla_attention.analyze.core.measure import means
 from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.render.figures import lines, stacked
@@ -51,8 +51,11 @@ def evolution_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
 
 
 def _write(path: Path, levels: Levels, number: int, layer: str) -> None:
-    rows, grouping = means(levels.measured[number], ("replan", "layer"), MORE), levels.grouping
-    cells = replan_cells(rows, grouping).filter(layer=layer).sort("replan")
+    measured, grouping = levels.measured[number], levels.grouping
+    rows, cells = (
+        means(measured, ("replan", "layer")),
+        replan_cells(measured, grouping).filter(layer=layer).sort("replan"),
+    )
     groups = rows.filter(kind="group", layer=layer).rename({"share": "fraction"}).sort("replan")
     with Style().settings():
         path.write_bytes(Style().content(_draw(cells, groups, grouping), "png"))

@@ -11,7 +11,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.core.levels import MORE, SIDES, Levels, replan_cells
+from vla_attention.analyze.core.levels import SIDES, Levels, replan_cells
 from vla_attention.analyze.core.measure import Measured, means
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -78,7 +78,7 @@ def documents_of(
     )  # fmt: skip
     others = [pl.struct(mean=pl.col(kind).mean(), std=pl.col(kind).std(ddof=0)).alias(kind) for kind in kinds]
     for _, i in sorted(order):
-        rows = _with_sides(means(measured[i], ("replan", "layer"), (*MORE, "whole")), grouping, proxy)
+        rows = _with_sides(measured[i], grouping, proxy)
         identity = rows.row(0, named=True)
         rows = rows.sort("replan", maintain_order=True).select("layer", "step", _RATIO, *kinds, "total_mass", *_KEYS)
         rows = rows.with_columns(pl.col([*whole]).cast(pl.Int64))
@@ -113,11 +113,11 @@ def write_results(path: Path, documents: Iterable[dict[str, Any]]) -> None:
         file.write("\n]\n" if next(separators) == ",\n" else "[]\n")
 
 
-def _with_sides(rows: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
-    """Add step, ratio (null where it is not finite), masses, fractions and numbers of keys of the two sides."""
-    on = [*EPISODE_ID, "replan", "layer"]
+def _with_sides(one: Measured, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
+    """The cells of replans with step, ratio (null where it is not finite), masses, fractions and numbers of keys."""
+    on, rows = [*EPISODE_ID, "replan", "layer"], means(one, ("replan", "layer"), ("whole",))
     keys = rows.filter(pl.col("kind").is_in(SIDES)).pivot("kind", index=[*on, "whole"], values="keys")
-    table = replan_cells(rows, grouping).drop("whole", strict=False).join(keys, on=on, maintain_order="left")
+    table = replan_cells(one, grouping).join(keys, on=on, maintain_order="left")
     if _ACTION in grouping.names:
         of_action = rows.filter(kind="group", group=_ACTION)
         named = of_action.select(*on, pl.col("mass").alias("action_mass"), pl.col("share").alias("action_fraction"))
