@@ -104,8 +104,8 @@ FAULTS = (
     Fault(
         "wrong weight of denoise steps: the last one alone",
         "analyze/core/measure.py",
-        "values = values.mean(axis=averaged, keepdims=True)",
-        'values = (values if "denoise" in by else values[:, :, -1:]).mean(axis=averaged, keepdims=True)',
+        "values = values.mean(axis=gone, keepdims=True)",
+        'values = (values if "denoise" in by else values[:, :, -1:]).mean(axis=gone, keepdims=True)',
         (CORE, GOLDEN),
     ),
     Fault(
@@ -132,8 +132,8 @@ FAULTS = (
     Fault(
         "stale cache key: files that changed since",
         "analyze/cache/remembered.py",
-        "hashlib.sha256(question + state + about)",
-        "hashlib.sha256(question + about)",
+        "hashlib.sha256(question.digest + state + about)",
+        "hashlib.sha256(question.digest + about)",
         ("tests/analyze/cache",),
     ),
     Fault(

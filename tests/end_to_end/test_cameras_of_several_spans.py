@@ -231,7 +231,7 @@ def test_objects_of_a_camera_are_measured_on_all_its_patches(made):
     )
     for number, thing in enumerate(OBJECTS):
         row = own.filter((pl.col("kind") == "object") & (pl.col("item") == thing.name))
-        np.testing.assert_allclose(row["mass"], (rows * covered[..., number]).sum(axis=1).mean(), rtol=1e-5)
+        np.testing.assert_allclose(row["mass"], (rows * covered[..., number]).sum(axis=1).mean(), rtol=2**-10)
         np.testing.assert_allclose(row["area_share"], covered[..., number].mean(), rtol=1e-5)
     rows = tables["pointing_episodes"].filter(pl.col("camera") == "front")["centre_row"]
     assert rows.is_between(0, PictureMap.of(layout, "front").rows).all()
