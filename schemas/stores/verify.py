@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.jsonable import decode_json
 from vla_attention.schemas.stores.digest import root_digest
 from vla_attention.schemas.stores.episode_checks import content_problems, form_problems
 from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
@@ -112,8 +113,8 @@ def _group_problems(store: Store, file: str) -> Iterator[str]:
     content = source_of(store.path).whole(file)
     attributes = group_attributes(content)
     if file == EPISODES_DOCUMENT:
-        if attributes:
-            yield "it has attributes, and the group of episodes has none"
+        if attributes or decode_json(content).keys() - {"attributes", "zarr_format", "node_type"}:
+            yield "it says more than that it is a group: the group of episodes has no attributes"
     elif not store.attributes.digest:
         yield "it has lost its own digest"
     elif store.attributes.digest != root_digest(attributes):

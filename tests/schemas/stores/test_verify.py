@@ -262,6 +262,12 @@ def test_the_command_line_says_it_and_fails(path, capsys):
     [
         (lambda path: (path / "episodes/zarr.json").unlink(), "episodes/zarr.json"),
         (
+            lambda path: edit_json(
+                path / "episodes/zarr.json", lambda group: group.update(attriButes=group.pop("attributes"))
+            ),
+            "episodes/zarr.json",
+        ),
+        (
             lambda path: edit_json(path / "episodes/zarr.json", lambda group: group["attributes"].update(a=1)),
             "episodes/zarr.json",
         ),
