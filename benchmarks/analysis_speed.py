@@ -136,7 +136,7 @@ class BareLoops:
         question = ask([open_store(store)], SETTINGS)
         arrays, wanted = [], []
         for item in question.selected:
-            row_sum = item.episode.read("joint/row_sum").mean(axis=(-2, -1))  # (replan, layer, denoise)
+            row_sum = item.episode.row_sum("joint").mean(axis=(-2, -1))  # (replan, layer, denoise)
             weights = items_of(item, question.grouping).with_totals(item)
             wanted.append(Wanted(weights, row_sum.reshape(len(row_sum), -1).T))
             arrays.append(item.episode.array("joint/rows"))

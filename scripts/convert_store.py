@@ -3,8 +3,8 @@
 Usage: python scripts/convert_store.py STORE.zarr|STORE.tar.xz [...]
 
 Stores are changed in place, one episode after the other; what is up to date stays as it is. Probabilities above 2^-29
-stay the same to the bit, smaller ones move by at most 2^-40. What uniform attention gives is left out where the keys'
-roles say it. Run it again after an interruption.
+stay the same to the bit, smaller ones move by at most 2^-40. Sums of rows go behind the masses of segments. What
+uniform attention gives is left out where the keys' roles say it. Run it again after an interruption.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from vla_attention.capture.store.codecs import keys_per_chunk
+from vla_attention.capture.store.codecs import RowCodec, keys_per_chunk, write_whole
 from vla_attention.capture.store.site_writer import ShardWriter
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import seal_episode
-from vla_attention.schemas.stores.store_format import ROW_AXES
+from vla_attention.schemas.stores.store_format import ATOM_AXES, ROW_AXES
 from vla_attention.schemas.stores.tar_files import unpack, write_tar
 
 
@@ -54,7 +55,7 @@ def convert(path: Path) -> int:
 
 def _convert_episode(store: Store, episode: StoredEpisode, folder: Path) -> bool:
     bits = store.attributes.recording.mantissa_bits
-    if all(record.chunks for record in episode.files.records.values() if record.index):
+    if not any(name.endswith("/row_sum") for name in episode.attributes.arrays):
         return False
     for file in episode.files.records:
         episode.files.check(file)
@@ -66,14 +67,24 @@ def _convert_episode(store: Store, episode: StoredEpisode, folder: Path) -> bool
         for site in store.attributes.sites:
             name = f"{site.name}/rows"
             group, keys = zarr.open_group(building, mode="r+", zarr_format=3), keys_per_chunk(site)
-            rows = np.asarray(group[name])
-            shutil.rmtree(building / name)
-            writer = ShardWriter(group, building, name, rows.shape[1:], bits, keys)
-            for of_replan in rows:
-                writer.append(of_replan)
-            arrays[name] = to_json(writer.finish(ROW_AXES))
+            if group[name].dtype != RowCodec.of_bits(bits).dtype:
+                rows = np.asarray(group[name])
+                shutil.rmtree(building / name)
+                writer = ShardWriter(group, building, name, rows.shape[1:], bits, keys)
+                for of_replan in rows:
+                    writer.append(of_replan)
+                arrays[name] = to_json(writer.finish(ROW_AXES))
+            if (sums := f"{site.name}/row_sum") in arrays:
+                atoms = np.concatenate([group[f"{site.name}/atoms"][:], group[sums][:][..., None]], axis=-1)
+                shutil.rmtree(building / sums)
+                shutil.rmtree(building / f"{site.name}/atoms")
+                write_whole(group, f"{site.name}/atoms", atoms, ATOM_AXES)
+                digest = ArrayDigest()
+                digest.update(atoms)
+                arrays[f"{site.name}/atoms"] = {"shape": atoms.shape, "sha256": digest.hexdigest()}
+                del arrays[sums]
             uniform = f"{site.name}/uniform"
-            if (np.asarray(group[uniform]) == episode.uniform_of_roles(site.name)).all():
+            if uniform in arrays and (np.asarray(group[uniform]) == episode.uniform_of_roles(site.name)).all():
                 shutil.rmtree(building / uniform)
                 del arrays[uniform]
         (building / "zarr.json").write_text(json.dumps(document, indent=2))

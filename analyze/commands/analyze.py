@@ -32,8 +32,8 @@ from vla_attention.analyze.core.listening import listens
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.sinks import SinkRule, search_sinks
 from vla_attention.analyze.core.sinks import without_sinks as take_out
-from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.analyze.published.plot_evolution import evolution_files
 from vla_attention.analyze.published.results_writer import results_files
 from vla_attention.analyze.statistics.intervals import says_a_size

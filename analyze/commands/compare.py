@@ -18,7 +18,7 @@ from vla_attention.analyze.core.pairs import PAIR
 from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.task_families import sampling_of
 from vla_attention.analyze.statistics.exact_tests import mcnemar
 from vla_attention.analyze.statistics.many_looks import NAMED_AT, SHOWN_AT

@@ -11,7 +11,7 @@ from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.compared import KINDS, Compared, RunValues, side_by_side, strip_of_pair
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.schemas.errors import shortened
 from vla_attention.schemas.safe_text import visible
 

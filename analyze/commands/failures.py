@@ -13,9 +13,9 @@ from vla_attention.analyze.core.behaviour import OTHER_GOAL, TOLD_SO, UNFINISHED
 from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.courses import LOOK, Leaving, beside, leavings, strip_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.safe_text import visible
 

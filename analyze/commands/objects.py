@@ -28,9 +28,9 @@ from vla_attention.analyze.core.object_shares import (
     with_coverage,
 )
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, frame_of_episodes
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import scan
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG, frame_of_episodes
 from vla_attention.schemas.errors import plural
 
 _AVERAGE = pl.col("layer") == LAYERS_AVG

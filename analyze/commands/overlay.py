@@ -26,9 +26,9 @@ from vla_attention.analyze.core.camera_maps import (
 )
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import check_replan, find_episode
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.render.video import check_video, write_film
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, with_groups

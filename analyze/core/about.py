@@ -12,8 +12,8 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.core.result import Column
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.measures.task_families import unknown_families
 from vla_attention.analyze.statistics.intervals import says_a_size
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units

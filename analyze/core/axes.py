@@ -9,7 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.core.measure import Measured
 from vla_attention.analyze.core.result import Column
-from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 

@@ -19,7 +19,7 @@ from vla_attention.analyze.core.axes import with_families
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.levels import Levels, groups_by, ratios_by
 from vla_attention.analyze.core.result import Column, Finding, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.statistics.many_looks import SHOWN_AT, adjusted_p_values
 from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.units import Sampling

@@ -16,10 +16,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import Axis, long_table
 from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
+from vla_attention.analyze.measures.tables import Axis, long_table
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name

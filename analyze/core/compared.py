@@ -26,9 +26,9 @@ from vla_attention.analyze.core.pairs import MOST_APART, pairing, pairs_of, with
 from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, float_values
 from vla_attention.analyze.measures.scan import scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG, float_values
 from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import BadArgument, listing

@@ -33,11 +33,11 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.result import Column, Table
-from vla_attention.analyze.measures.frames import LAYERS_AVG, Axis, frame_of_episodes, long_table
 from vla_attention.analyze.measures.masses import finite_mean, ratio, uniform_keys, uniform_masses
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import OnDisk
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
+from vla_attention.analyze.measures.tables import LAYERS_AVG, Axis, frame_of_episodes, long_table
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
@@ -188,7 +188,7 @@ def joint_norm(gram: NDArray[np.floating], chosen: NDArray[np.bool_], weights: A
 def segment_masses(item: SelectedEpisode, site: str, selection: Selection) -> Array:
     """Masses (replan, layer, denoise, segment) of the selected layers and denoise steps, mean over all stored heads."""
     atoms = item.episode.read(f"{site}/atoms")[:, list(selection.layers)][:, :, list(selection.denoise)]
-    return np.asarray(atoms.mean(axis=(3, 4), dtype=np.float64))
+    return np.asarray(atoms[..., :-1].mean(axis=(3, 4), dtype=np.float64))
 
 
 def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> Array:

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.measure import look_at, table_of
 from vla_attention.analyze.core.object_shares import ALL_CAMERAS, cameras_of, look_at_objects, object_times
 from vla_attention.analyze.core.word_items import items_of
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.schemas.episode_steps import HAND, POSES
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import BaseEpisode, counted
 from vla_attention.analyze.core.hand_movements import TRANSLATION
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.stores.selection import read_usable
 from vla_attention.schemas.effects import CHANGE
 from vla_attention.schemas.episode_steps import HAND, POSES

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.frames import float_values
+from vla_attention.analyze.measures.tables import float_values
 from vla_attention.analyze.statistics.intervals import (
     NO_LIMITS,
     POSITIVE,

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.measure import Items, Measured, averaged, axes_of, look_at, table_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG, frame_of_episodes, long_table
 from vla_attention.analyze.measures.masses import finite_mean, ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_not_empty, resolve_episode
+from vla_attention.analyze.measures.tables import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG, frame_of_episodes, long_table
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping

@@ -17,7 +17,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import (
+from vla_attention.analyze.measures.masses import finite_mean, masses, uniform_keys, uniform_masses
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.scan import Look, OnDisk, scan
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import (
     EPISODE_KEYS,
     Axis,
     frame_of_episodes,
@@ -25,10 +29,6 @@ from vla_attention.analyze.measures.frames import (
     layer_axis,
     long_table,
 )
-from vla_attention.analyze.measures.masses import finite_mean, masses, uniform_keys, uniform_masses
-from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.scan import Look, OnDisk, scan
-from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import LayerRows
 from vla_attention.analyze.stores.selection import Selection
@@ -222,7 +222,7 @@ class _ItemMasses:
         members = segment_members(tokens.layout, tokens.static_roles, segments)
         self.of_segments, cut = weights_on_segments(self.weights, members)
         self.cut = np.asarray(cut.any(axis=0))
-        atoms = _selected_cells(item.episode.read_once(f"{site}/atoms"), selection).mean(axis=-2)
+        atoms = _selected_cells(item.episode.read_once(f"{site}/atoms")[..., :-1], selection).mean(axis=-2)
         self.atoms = atoms if selection.per_head else atoms.mean(axis=3, keepdims=True)
         # The parts of segments that items take, then the segments whole.
         self.pairs = [(int(i), int(segment)) for segment, i in np.argwhere(cut)]
@@ -262,7 +262,7 @@ class _ItemMasses:
         seen = mass if item.store.attributes.interventions.keys else uniform
         far = (seen[..., :-2] > 0) & (rounded[:, None, None, None] > _UNSURE * mass[..., :-2])
         # As they were before storage rounded the rows.
-        row_sum = _selected_cells(item.episode.read_once(f"{self.site}/row_sum"), self.selection).mean(axis=-1)
+        row_sum = _selected_cells(item.episode.row_sum(self.site), self.selection).mean(axis=-1)
         row_sum = row_sum if self.selection.per_head else row_sum.mean(axis=-1, keepdims=True)
         arrays = {
             "mass": mass[..., :-2],

@@ -42,11 +42,11 @@ from vla_attention.analyze.core.object_shares import (
     object_times,
     with_coverage,
 )
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.statistics.left_out import pseudo_values
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.stores.run_notes import same_words, told_instruction

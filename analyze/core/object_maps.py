@@ -38,11 +38,11 @@ from vla_attention.analyze.core.pointing_and_iou import (
     shifted_iou,
     shifted_masks,
 )
-from vla_attention.analyze.measures.frames import EPISODE_KEYS, Axis, head_axis, layer_axis, long_table, with_average
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
+from vla_attention.analyze.measures.tables import EPISODE_KEYS, Axis, head_axis, layer_axis, long_table, with_average
 from vla_attention.analyze.stores.rows import LayerRows
 from vla_attention.analyze.stores.selection import Selection
 

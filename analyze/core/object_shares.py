@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.core.measure import Items, Measured, look_at, table_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.tables import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, SceneObject
 

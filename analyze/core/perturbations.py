@@ -9,8 +9,8 @@ import polars as pl
 
 from vla_attention.analyze.core.naming import Naming
 from vla_attention.analyze.core.result import Column, Finding, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.schemas.errors import plural
 
 #: What a suite of LIBERO-PRO changes, by the end of its name.

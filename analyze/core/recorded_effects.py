@@ -28,10 +28,10 @@ from vla_attention.analyze.core.axes import weighted, with_families
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.measure import Items, Measured, means, measure
-from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns, frame_of_episodes
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.scan import OnDisk
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_episode, vocabulary_of
+from vla_attention.analyze.measures.tables import EPISODE_ID, episode_columns, frame_of_episodes
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode

@@ -22,7 +22,7 @@ from vla_attention.analyze.core.action_changes import (
 )
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.runs import Run
-from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.safe_text import visible

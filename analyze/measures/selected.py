@@ -65,7 +65,7 @@ class SelectedEpisode:
 
     @property
     def key(self) -> tuple[str, int, int]:
-        """Its suite, the number of its task, and its own: the values of `frames.EPISODE_ID`."""
+        """Its suite, the number of its task, and its own: the values of `tables.EPISODE_ID`."""
         return (*self.task, self.episode.attributes.episode_index)
 
     @property

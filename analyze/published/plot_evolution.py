@@ -12,7 +12,7 @@ import polars as pl
 
 from vla_attention.analyze.core.levels import Levels, replan_cells
 from vla_attention.analyze.core.measure import means
-from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
+from vla_attention.analyze.measures.tables import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.render.figures import lines, stacked
 from vla_attention.analyze.render.numbers import format_number
 from vla_attention.analyze.render.style import NOTE_COLOR, Style, explain, wrapped

@@ -25,7 +25,7 @@ from typing import Any, get_args
 import polars as pl
 from msgspec.structs import fields
 
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.schemas.errors import listing, shortened
 from vla_attention.schemas.foreign_files import read_regular
 from vla_attention.schemas.jsonable import decode_json

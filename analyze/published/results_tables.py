@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from vla_attention.analyze.core.levels import LAYER, over_replans, task_cells, task_groups
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.measures.tables import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.published.results_reader import RATIO, ResultsFile, ResultsKind
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio

@@ -10,7 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.core.levels import overall
 from vla_attention.analyze.core.result import Column, Table
-from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
+from vla_attention.analyze.measures.tables import LAYERS_AVG, layer_name
 from vla_attention.analyze.measures.task_families import related_instructions
 from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind
 from vla_attention.analyze.published.results_tables import (

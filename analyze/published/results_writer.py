@@ -13,7 +13,7 @@ import polars as pl
 
 from vla_attention.analyze.core.levels import SIDES, Levels, replan_cells
 from vla_attention.analyze.core.measure import Measured, means
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
 from vla_attention.schemas.layout import SiteLayout

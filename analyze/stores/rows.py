@@ -76,7 +76,7 @@ def layer_rows(
     name, recording, layout = f"{site}/rows", root.recording_of(site), root.site(site)
     every = range(layout.num_keys)
     keys = every if keys is None else keys
-    sums = episode.read_once(f"{site}/row_sum") if keys == every else _sums_of_segments(episode, layout, keys)
+    sums = episode.row_sum(site) if keys == every else _sums_of_segments(episode, layout, keys)
     # A slice where it can be one: picking heads by their numbers copies every row.
     replans, *_, stored, queries, _ = episode.shape_of(name)
     heads = slice(None) if selection.heads == tuple(range(stored)) else list(selection.heads)

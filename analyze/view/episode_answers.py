@@ -26,12 +26,12 @@ from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_ca
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.measure import Measured, look_at, means
 from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects, selected_items
-from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan, resolve_episode
+from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.analyze.stores.rows import LayerRows, layer_rows
 from vla_attention.analyze.stores.run_notes import same_words, told_instruction
 from vla_attention.analyze.stores.selection import Selection, select

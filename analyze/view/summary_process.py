@@ -20,9 +20,9 @@ import polars as pl
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.about import sides
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.analyze.view.summaries import OURS
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store

@@ -112,8 +112,8 @@ def _most_inodes(recording: Recording, sites: Sequence[SiteLayout], pictures: in
     """Most files and folders of an episode: an array is a folder with two files, a group a folder with one."""
     effects, frames = recording.effects is not None, pictures if recording.frames else 0
     cameras = sum(span.grid is not None for site in sites for span in site.spans)
-    # Of a site: rows, sums, atoms, roles, uniform attention. Once: actions and state, three arrays of the steps.
-    arrays = len(sites) * (5 + recording.contributions + effects) + 2 + 3 + frames + cameras + effects
+    # Of a site: rows, atoms, roles, uniform attention. Once: actions and state, three arrays of the steps.
+    arrays = len(sites) * (4 + recording.contributions + effects) + 2 + 3 + frames + cameras + effects
     # The episode, its seal and steps, its sites; pictures twice, objects, effects.
     groups = 3 + len(sites) + (2 if frames else 0) + (1 if cameras else 0) + effects
     return 3 * arrays + 2 * groups

@@ -161,6 +161,7 @@ class EpisodeWriter:
             yield from self._broken_rules({f"{name}/key_role": roles[None]}, shapes)
             yield from piece_role_problems(sites, site.layout, roles, record.prompt, replan)
             shapes = site_shapes(site.layout, site.recording, 1, len(segments_of(site.layout, roles)))
+            shapes[f"{name}/row_sum"] = shapes[f"{name}/rows"][:-1]
             arrays, gram = site.arrays(record.rows[name], roles), f"{name}/contribution"
             if (gram in shapes) is not (gram in arrays):
                 yield f"it has {'no' if gram in shapes else 'an unplanned'} {gram}"

@@ -166,9 +166,10 @@ class SiteWriter:
         self.segments = merge_segments(self.layout, (segments for segments, _ in self.masses))
         column = {segment: i for i, segment in enumerate(self.segments)}
         columns = [[column[segment] for segment in segments] for segments, _ in self.masses]
-        atoms = np.zeros((len(columns), *self.shape, len(column)), dtype=np.float32)
+        atoms = np.zeros((len(columns), *self.shape, len(column) + 1), dtype=np.float32)
         for replan, (at, (_, masses)) in enumerate(zip(columns, self.masses, strict=True)):
             atoms[replan][..., at] = masses
+        atoms[..., -1] = self._of_replans("row_sum")
         self.write(f"{name}/atoms", atoms, ATOM_AXES)
         if self.recording.contributions:
             grams = np.zeros((len(columns), *self.shape[:2], len(column) + 1, len(column) + 1), dtype=np.float32)
@@ -177,7 +178,6 @@ class SiteWriter:
                 parts = np.array([*at, len(column)])
                 grams[replan][..., parts[:, None], parts] = gram
             self.write(f"{name}/contribution", grams, CONTRIBUTION_AXES)
-        self.write(f"{name}/row_sum", np.stack(self._of_replans("row_sum")), ROW_AXES[:-1])
         roles = np.stack(self._of_replans("key_role"))
         self.write(f"{name}/key_role", roles, ("replan", "key"))
         return {f"{name}/rows": self.rows.finish(ROW_AXES)} | self._write_uniform(roles)

@@ -9,7 +9,7 @@ first (denoise step by denoise step, layer by layer).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -206,9 +206,10 @@ def _given(rows: NDArray[np.float32], never: NDArray[np.bool_]) -> NDArray[np.bo
 
 
 def _atom_problems(block: Block) -> Iterator[str]:
-    """Masses (replan, layer, denoise, head, query, segment) add up to the row sums, too."""
-    sums = block.beside(f"{block.site.name}/row_sum")
-    return row_problems(block.name, block.values, sums, block.recording, FLOAT32_MANTISSA_BITS, block.first)
+    """Masses (replan, layer, denoise, head, query, segment) add up to the row sums, which stand behind them."""
+    masses, sums = block.values[..., :-1], block.values[..., -1]
+    yield from row_problems(block.name, masses, sums, block.recording, FLOAT32_MANTISSA_BITS, block.first)
+    yield from _row_sum_problems(replace(block, values=sums))
 
 
 def _uniform_problems(block: Block) -> Iterator[str]:
@@ -365,8 +366,7 @@ def site_shapes(site: SiteLayout, recording: Recording, replans: int, segments: 
     cells = (*plan, len(recording.heads), recording.num_queries)
     shapes = {
         "rows": (*cells, site.num_keys),
-        "row_sum": cells,
-        "atoms": (*cells, segments),
+        "atoms": (*cells, segments + 1),
         "key_role": (replans, site.num_keys),
         "uniform": (*cells, site.num_keys),
     }

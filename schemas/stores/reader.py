@@ -265,6 +265,10 @@ class StoredEpisode:
         if _holds_missing(values) or (name.endswith("/key_role") and not values.all()):
             raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
 
+    def row_sum(self, site: str) -> NDArray[np.float32]:
+        """Sums of the rows as they were computed, (replan, layer, denoise, head, query)."""
+        return np.asarray(self.read_once(f"{site}/atoms")[..., -1])
+
     def uniform(self, site: str) -> NDArray[np.float32]:
         """What uniform attention gives in the place of each row, with the axes of `SITE/rows`.
 
@@ -283,11 +287,11 @@ class StoredEpisode:
     def check_rows(self, root: RootAttributes, site: str) -> None:
         """Raise `CorruptEpisode` when the rows of a site are not stored as float16 or float32 as their precision is."""
         stored, bits = self.array(f"{site}/rows").metadata, root.recording.mantissa_bits
-        if stored.is_half is not is_half(bits):
+        if stored.is_half is not is_half(bits) or f"{site}/row_sum" in self.attributes.arrays:
             raise CorruptEpisode(
-                f"Array {site}/rows of episode {self.name} has the type {stored.dtype.name}; expected "
-                f"{'float16' if is_half(bits) else 'float32'} for {bits} mantissa bits. A store of before 29 November "
-                "2026 is brought up to date by: python scripts/convert_store.py STORE (of the project's repository)."
+                f"Array {site}/rows of episode {self.name} has an earlier form ({stored.dtype.name}); expected "
+                f"{'float16' if is_half(bits) else 'float32'}, and its sums behind {site}/atoms. A store of before 30 "
+                "November 2026 is brought up to date by: python scripts/convert_store.py STORE (in the repository)."
             )
 
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:

@@ -7,8 +7,7 @@ NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
     joint/                            attributes: the numbers of its recorded layers, denoise steps and heads
     joint/rows                        (replan, layer, denoise, head, query, key) float16 of p x 2^15, or float32
-    joint/row_sum                     (replan, layer, denoise, head, query) float32
-    joint/atoms                       (replan, layer, denoise, head, query, segment) float32
+    joint/atoms                       (replan, layer, denoise, head, query, segment) float32; last the whole row
     joint/uniform                     as `rows`, float32; an axis along which nothing changes has length 1; only where
                                       the roles do not say it
     joint/key_role                    (replan, key) uint8

@@ -75,7 +75,7 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     camera = policy["cameras"][0]["name"]
     assert episode[f"frames/{camera}"].shape == (2, 56, 56, 3)
     assert np.isfinite(probabilities(episode["joint/rows"])).all()
-    np.testing.assert_allclose(episode["joint/row_sum"][:], 1, atol=1e-5)
+    np.testing.assert_allclose(episode["joint/atoms"][..., -1], 1, atol=1e-5)
     if prompt == "task-state-action":
         prompt_read = dict(episode.attrs)["prompts"][0]
         assert prompt_read["pieces"][-1]["stop"] < len(prompt_read["text"])

@@ -149,7 +149,7 @@ def attacks(arrays: list[str]) -> dict[str, Attack]:
             *(store / "episodes" / FIRST / array for store in (path, other))
         )
         found[f"{array} with another bit"] = lambda path, other, array=array: flip_bit(first(path), array)
-    for one, two_ in (("frames/base_0_rgb", "frames/left_wrist_0_rgb"), ("joint/row_sum", "joint/atoms")):
+    for one, two_ in (("frames/base_0_rgb", "frames/left_wrist_0_rgb"), ("joint/key_role", "joint/atoms")):
         found[f"{one} exchanged with {two_}"] = lambda path, other, pair=(one, two_): exchange(
             *(files_of(first(path), array)[0] for array in pair)
         )

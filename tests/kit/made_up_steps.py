@@ -13,7 +13,7 @@ import polars as pl
 
 from vla_attention.analyze.core.levels import SIDES, Levels, task_cells, task_groups
 from vla_attention.analyze.core.measure import Measured
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS
+from vla_attention.analyze.measures.tables import EPISODE_ID, EPISODE_KEYS
 from vla_attention.analyze.published.results_writer import documents_of, write_results
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.selection import Selection

@@ -391,20 +391,20 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
     """Name to values of the arrays that a reader must find in one episode, to the bit.
 
     Among them are numbers that are attributes of the episode, such as `env_step`. Left out is `joint/contribution`.
-    Rows are rounded to the spec's mantissa bits; `joint/atoms` has the segments of `segments_of` on its last axis.
+    Rows are rounded to the spec's mantissa bits; `joint/atoms` has the segments of `segments_of`, then the sum.
     """
     _, records = episode_records(spec, task, episode)
     rows = np.stack([record.rows["joint"].rows for record in records])
     roles = np.stack([record.key_role["joint"] for record in records])
+    sums = [record.rows["joint"].row_sum for record in records]
     members = segment_members(spec.layout, roles, segments_of(spec.layout, roles))
     prompts = list(dict.fromkeys(record.prompt for record in records))
     arrays: dict[str, NDArray[Any]] = {
         "joint/rows": as_read(rows, spec.mantissa_bits),
-        "joint/row_sum": np.stack([record.rows["joint"].row_sum for record in records]),
         "joint/atoms": np.stack(
             [
-                (row.astype(np.float64) @ of.astype(np.float64)).astype(np.float32)
-                for row, of in zip(rows, members, strict=True)
+                np.append(row.astype(np.float64) @ of.astype(np.float64), row_sum[..., None], -1).astype(np.float32)
+                for row, of, row_sum in zip(rows, members, sums, strict=True)
             ]
         ),
         **_uniform_once([record.rows["joint"].uniform for record in records], roles),

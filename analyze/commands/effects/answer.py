@@ -36,8 +36,8 @@ from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.recorded_effects import ITEM, RecordedEffects, recorded_effects, summary_of
 from vla_attention.analyze.core.result import Figure, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.schemas.errors import BadArgument, listing, plural
 
 _MISSING = "What if a word is left out?"

@@ -18,9 +18,9 @@ from vla_attention.analyze.core.action_changes import ActionSpread, action_sprea
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, long_table, replan_axis
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID, LAYERS_AVG, long_table, replan_axis
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.reader import Store, StoredEpisode

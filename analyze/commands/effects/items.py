@@ -12,8 +12,8 @@ from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.recorded_effects import ITEM, times
 from vla_attention.analyze.core.result import Column, Figure, Finding
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing

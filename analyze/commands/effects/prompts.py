@@ -12,8 +12,8 @@ from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.directions import directions, things_of_sentences
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Finding, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing, plural
 

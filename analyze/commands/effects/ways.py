@@ -10,8 +10,8 @@ import polars as pl
 from vla_attention.analyze.commands.effects.items import IS_WORD, LESS, MORE, MOST_NAMED, OPEN, named_sizes
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.result import Finding
-from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.tables import EPISODE_ID
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing
 

@@ -32,7 +32,7 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
 ARRAYS = (
-    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "row_sum", "rows")),
+    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "rows")),
     *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),
     *("actions", "state"),
 )
@@ -185,7 +185,7 @@ def outcome(
         return error
 
 
-@pytest.mark.parametrize("array", ["joint/atoms", "joint/row_sum", "joint/rows"])
+@pytest.mark.parametrize("array", ["joint/atoms", "joint/rows"])
 def test_a_byte_that_changes_in_place_is_noticed_whatever_the_dates_say(cache, stores, array):
     question = WORDS if array == "joint/rows" else SPANS
     tables(stores[0], **question)

@@ -9,7 +9,7 @@ import pytest
 from tests.kit import made_up_steps
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
 from vla_attention.analyze.core.levels import overall
-from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.schemas.groupings.grouping import Ratio
 
 GROUPING = default_grouping()

@@ -58,7 +58,7 @@ def test_masses_equal_sums_over_raw_rows_and_add_up_to_the_row_sums(data):
         )
         table = table_of(path, grouping, per_head)
         raw = zarr.open_group(path / "episodes/task000_episode000", mode="r")["joint"]
-        rows, sums = probabilities(raw["rows"]).astype(np.float64), raw["row_sum"][:].astype(np.float64)
+        rows, sums = probabilities(raw["rows"]).astype(np.float64), raw["atoms"][..., -1].astype(np.float64)
     rows, sums = rows.mean(axis=4), sums.mean(axis=4)
     if not per_head:
         rows, sums = rows.mean(axis=3, keepdims=True), sums.mean(axis=3, keepdims=True)

@@ -27,7 +27,7 @@ from vla_attention.schemas.stores.verify import verify_store
 #: Both episodes of a task have arrays of the same shapes; rows are in three blocks.
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
 ARRAYS = (
-    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "row_sum", "rows", "uniform")),
+    *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "rows", "uniform")),
     *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),
     *("actions", "state"),
 )
@@ -146,7 +146,7 @@ COMMANDS = {
     "analyze": (["--no-plots"], "joint/atoms"),
     "words": (["--no-plots"], "joint/rows"),
     "objects": (["--no-plots"], "objects/base_0_rgb"),
-    "analyze --by layer,head": (["--csv"], "joint/row_sum"),
+    "analyze --by layer,head": (["--csv"], "joint/atoms"),
     "analyze --list": (["--no-plots"], "joint/key_role"),
     "overlay": (["--replans", "0"], "joint/key_role"),
     "report": ([], "joint/key_role"),

@@ -68,7 +68,7 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     assert (policy["family"], policy["checkpoint"], policy["config"]["size"]) == ("toy", "toy-weights", 3)
     episode = zarr.open_group(store / "episodes/task000_episode001", mode="r")
     assert episode["joint/rows"].shape == (3, 1, 1, 2, 1, 7)
-    np.testing.assert_allclose(episode["joint/row_sum"][:], 1, rtol=1e-6)
+    np.testing.assert_allclose(episode["joint/atoms"][..., -1], 1, rtol=1e-6)
     # The ratio is the family's own default of the analysis.
     steps = pl.read_parquet(tmp_path / "steps.parquet")
     assert steps.height == 6

@@ -1,7 +1,7 @@
 """How many files and folders captured episodes have: clusters and hubs count them.
 
-Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 9
-files, 11 with contributions, as the sites here do.
+Not here, because they need packages of their own: policies of LeRobot and GR00T (`tests/policies`). Each site takes 7
+files, 9 with contributions, as the sites here do.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import open_store
 
-MOST_FILES = 45
+MOST_FILES = 41
 WHERE = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "30")
 TINY = ("--checkpoint", "untrained-tiny")
 CAMERAS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
@@ -62,7 +62,7 @@ def still_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pi_its_reruns_and_replays(tmp_path):
     store = tmp_path / "run.zarr"
     run("pi", *WHERE, *TINY, "--queries", "all", "--denoise", "all", "--contributions", "--output", store)
-    assert check_few(store, 34) == 34
+    assert check_few(store, 32) == 32
     run("rerun", store, "--knockout", "camera:base_0_rgb", "--output", tmp_path / "without.zarr")
     check_few(tmp_path / "without.zarr")
     data = write_data_set(tmp_path / "data", "v3.0", episodes_of_store(store, CAMERAS))

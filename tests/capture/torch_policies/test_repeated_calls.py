@@ -175,7 +175,7 @@ def test_actions_rows_and_random_numbers_are_those_of_a_run_without_effects(tmp_
     assert all(map(torch.equal, actions, plain_actions))
     assert state == plain_state
     for episode, other in zip(plain.episodes, measured.episodes, strict=True):
-        for name in ("joint/rows", "joint/row_sum", "joint/contribution", "actions", "joint/key_role"):
+        for name in ("joint/rows", "joint/atoms", "joint/contribution", "actions", "joint/key_role"):
             assert np.array_equal(episode.read(name), other.read(name)), name
         assert np.array_equal(episode.uniform("joint"), other.uniform("joint"))
     for replan in range(2):

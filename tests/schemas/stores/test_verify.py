@@ -26,7 +26,6 @@ EPISODE = "task000_episode000"
 ARRAYS = (
     "joint/rows",
     "joint/atoms",
-    "joint/row_sum",
     "joint/key_role",
     "frames/base_0_rgb",
     "objects/left_wrist_0_rgb",
