@@ -124,7 +124,7 @@ def _scanned(given: tuple[SelectedEpisode, Sequence[Begun]], site: str) -> list[
         keys = whole_spans(item.tokens.layout, item.episode.array(f"{site}/rows").metadata, first, stop)
         per_head = any(selection.per_head for _, selection in reading)
         for part in layer_rows(item.store.attributes, item.episode, reading[0][1], site, per_head, keys):
-            over_heads = replace(part, rows=part.of_heads(False)) if len(reading) and per_head else part
+            over_heads = replace(part, rows=part.of_heads(False)) if per_head else part
             for reducer, selection in reading:
                 reducer.add(part if selection.per_head else over_heads)
     return [reducer.content() for reducer, _ in reducers]
