@@ -114,7 +114,11 @@ class Series:
             now = len(self._names())
             if now > committed:
                 took, began, wanted, committed = time.monotonic() - began, time.monotonic(), wanted - 1, now
-            if wanted <= 0 and list(writing.glob("task*-*")):
+            try:
+                is_written = any(name.startswith("task") and "-" in name for name in os.listdir(writing))
+            except FileNotFoundError:  # between two episodes
+                is_written = False
+            if wanted <= 0 and is_written:
                 time.sleep(random.uniform(0, took or _PAUSE_S))
                 return not forks.ended(process)
             time.sleep(0.003)
