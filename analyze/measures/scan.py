@@ -127,7 +127,9 @@ def _scanned(given: tuple[SelectedEpisode, Sequence[Begun]], site: str) -> list[
             over_heads = replace(part, rows=part.of_heads(False)) if per_head else part
             for reducer, selection in reading:
                 reducer.add(part if selection.per_head else over_heads)
-    return [reducer.content() for reducer, _ in reducers]
+    contents = [reducer.content() for reducer, _ in reducers]
+    item.episode.forget()  # one that is elsewhere stays open for the next scan
+    return contents
 
 
 class OnDisk(Sequence[Member], Generic[Member]):

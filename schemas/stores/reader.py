@@ -204,10 +204,14 @@ class StoredEpisode:
         return values[0] if isinstance(index, int) else values
 
     def read_once(self, name: str) -> NDArray[Any]:
-        """As `read`, of a small array that several need; kept as long as this object lives, and not to be changed."""
+        """As `read`, of a small array that several need; kept until `forget` is called, and not to be changed."""
         if name not in self._once:
             self._once[name] = self.read(name)
         return self._once[name]
+
+    def forget(self) -> None:
+        """Let go of what `read_once` has kept."""
+        self._once.clear()
 
     def read_stored(self, name: str, first: int, stop: int) -> NDArray[Any]:
         """Numbers of one array as they are stored, from one index along the first axis to another; see `values_of`."""
