@@ -70,7 +70,7 @@ def to_stored(values: NDArray[np.float32], bits: int) -> NDArray[Any]:
 
     if not is_half(bits):
         return round_mantissa(values, bits)
-    scaled = np.asarray(values, np.float32) * np.float32(1 / HALF_SCALE)
+    scaled = np.asarray(values, np.float32) * np.float32(1 / HALF_SCALE) + np.float32(0)  # -0 becomes 0
     stored = (scaled if bits == HALF_MANTISSA_BITS else round_mantissa(scaled, bits)).astype("<f2")
     if not in_range(stored):
         raise ValueError("probabilities that are negative, above 1.99 or no numbers cannot be stored as float16")

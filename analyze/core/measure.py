@@ -222,7 +222,7 @@ class _ItemMasses:
         members = segment_members(tokens.layout, tokens.static_roles, segments)
         self.of_segments, cut = weights_on_segments(self.weights, members)
         self.cut = np.asarray(cut.any(axis=0))
-        atoms = _selected_cells(item.episode.read_once(f"{site}/atoms")[..., :-1], selection).mean(axis=-2)
+        atoms = _selected_cells(item.episode.keep(f"{site}/atoms")[..., :-1], selection).mean(axis=-2)
         self.atoms = atoms if selection.per_head else atoms.mean(axis=3, keepdims=True)
         # The parts of segments that items take, then the segments whole.
         self.pairs = [(int(i), int(segment)) for segment, i in np.argwhere(cut)]
@@ -234,7 +234,7 @@ class _ItemMasses:
         self.keys = range(taken[0], taken[-1] + 1) if taken.size else None
         if self.keys is not None:
             self.parts = np.ascontiguousarray(self.parts[:, self.keys.start : self.keys.stop])
-        self.found = np.zeros((*self.atoms.shape[:-1], len(parts)))
+        self.found = np.zeros((*self.atoms.shape[:-1], len(parts)), np.float32)
 
     def add(self, part: LayerRows) -> None:
         """Add the masses of the items that cut a segment."""

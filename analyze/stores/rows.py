@@ -30,16 +30,21 @@ class LayerRows:
         keys: which keys the rows have.
         rows: probabilities (replan, head, key) float32, mean over the stored queries, of the selected heads; or their
             mean over these heads, (replan, 1, key).
+        stored: those of each query, (replan, head, query, key), where they are known.
     """
 
     layer: int
     denoise: int
     keys: range
     rows: NDArray[np.float32]
+    stored: NDArray[np.float32] | None = None
 
     def of_heads(self, per_head: bool) -> NDArray[np.float32]:
-        """The rows of each head, where they were read so, or the mean over heads."""
-        return self.rows if per_head or self.rows.shape[1] == 1 else _mean(self.rows, None)
+        """The rows of each head, where they were read so, or their mean, to the bit as it is read without heads."""
+        if per_head or self.rows.shape[1] == 1:
+            return self.rows
+        stored = self.rows[:, :, None] if self.stored is None else self.stored
+        return _mean(stored.reshape(len(stored), 1, -1, stored.shape[-1]), None)
 
 
 def whole_spans(layout: SiteLayout, chunks: ArrayMetadata, first: int, stop: int) -> range:
@@ -87,32 +92,32 @@ def layer_rows(
     cells = [(i, j) for i in range(len(selection.layers)) for j in range(len(selection.denoise))]
     places = [(selection.layers[i], selection.denoise[j]) for i, j in cells]
     for (i, j), (layer, step), whole in zip(cells, places, episode.read_layers(name, places, keys), strict=True):
-        parts = whole[:, heads].reshape(replans, -1, of_mean, len(keys))
+        chosen = whole[:, heads]
+        parts = chosen.reshape(replans, -1, of_mean, len(keys))
         rows = parts[:, :, 0] if mean is None else _mean(parts, mean)
         # Sums in float32 (replan, head, query): of the rows that are given on, so that one pass suffices.
         expected = sums[:, layer, step][:, heads].reshape(replans, -1, of_mean).mean(axis=-1)
         if not add_up(rows, expected, recording.mantissa_bits):
             here = replace(recording, layers=(recording.layers[layer],), denoise_steps=(recording.denoise_steps[step],))
             _refuse(episode, name, whole, sums[:, layer, step], here)
-        yield LayerRows(i, j, keys, rows)
+        yield LayerRows(i, j, keys, rows, chosen)
 
 
 def _mean(parts: NDArray[np.float32], into: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """Mean over the parts, a product with their shares, which is a BLAS call.
+    """Mean of (replan, head, part, key) over the parts, a product with their shares, which is a BLAS call.
 
-    parts: (replan, head, part, key), of which (replan, head, key) is made in the memory `into`; or (replan, head, key),
-    of which (replan, 1, key).
+    into: memory (replan, head, 1, key) for it.
     """
     share = np.full((1, parts.shape[-2]), 1 / parts.shape[-2], np.float32)
     found: NDArray[np.float32] = np.matmul(share, parts, out=into)
-    return found if parts.ndim == 3 else found[:, :, 0]
+    return found[:, :, 0]
 
 
 def _sums_of_segments(episode: StoredEpisode, layout: SiteLayout, keys: range) -> NDArray[np.float32]:
     """What rows of the keys of whole spans add up to, from the stored masses: (replan, layer, denoise, head, query)."""
     inside = {span.name for span in layout.spans if span.start >= keys.start and span.stop <= keys.stop}
     segments = [i for i, one in enumerate(episode.attributes.segments[layout.name]) if one.span in inside]
-    masses = episode.read_once(f"{layout.name}/atoms")[..., segments]
+    masses = episode.read_kept(f"{layout.name}/atoms")[..., segments]
     return np.asarray(masses.sum(axis=-1, dtype=np.float64), np.float32)
 
 

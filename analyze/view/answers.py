@@ -93,12 +93,15 @@ class Answers:
         for site in shown.store.attributes.sites:
             with suppress(UserError):  # each answer says what is wrong with it
                 shown.read_ahead(site.name, heads)
-        for address in _addresses(shown, heads):
-            try:
-                content, _ = self.answer([served], ("runs", "0", name, *address.split("/")), {})
-            except UserError as error:
-                content, _ = error_answer(error)
-            yield address, content
+        try:
+            for address in _addresses(shown, heads):
+                try:
+                    content, _ = self.answer([served], ("runs", "0", name, *address.split("/")), {})
+                except UserError as error:
+                    content, _ = error_answer(error)
+                yield address, content
+        finally:
+            shown.let_go()
 
     def _shown(self, store: Store, name: str) -> ShownEpisode:
         """An episode that stays open for its other answers, unless it was recorded again."""

@@ -9,6 +9,7 @@ import io
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -44,6 +45,7 @@ from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import check_names
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 Array = NDArray[Any]
 #: An object is where it covers at least this part of a patch.
@@ -248,6 +250,10 @@ class ShownEpisode:
         self._read[site] = kept[0]
         self._grids[site] = self._grid_of(site, grids[0])
 
+    def let_go(self) -> None:
+        """Forget the rows that were read ahead."""
+        self._read.clear()
+
     def uniform(self, site: str, layer: str) -> Array:
         """What uniform attention gives in the place of `rows`, (replan or 1, denoise or 1, key)."""
         selection = self._selection(site, layer)
@@ -311,10 +317,11 @@ class ShownEpisode:
     def grid(self, site: str, selector: str) -> dict[str, Any]:
         """`grid.json`: mass and lift of a selector's keys in every head, (replan, layer, head)."""
         if selector in [target["selector"] for target in self.targets(site)]:
-            if site not in self._grids:
-                ((measured,),) = scan(self.question(site), [self._look_at_targets(site)])
-                self._grids[site] = self._grid_of(site, measured)
-            return self._grids[site][selector]
+            with suppress(CorruptEpisode):  # it may be answered alone: from the masses of whole segments
+                if site not in self._grids:
+                    ((measured,),) = scan(self.question(site), [self._look_at_targets(site)])
+                    self._grids[site] = self._grid_of(site, measured)
+                return self._grids[site][selector]
         question = self.question(site, groups=(f"own={selector}",))
         (measured,) = levels_of(question, heads=True).measured
         return _grid(question, means(measured, ("replan", "layer", "head")).filter(group="own"))

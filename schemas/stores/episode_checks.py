@@ -68,7 +68,7 @@ def form_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Prob
         if not name.endswith("/uniform"):  # where the roles of the keys say it
             yield Problem(f"{name} is not in the episode")
     for site in root.sites:
-        if f"{site.name}/rows" in listed:
+        if {f"{site.name}/rows", f"{site.name}/atoms"} <= listed.keys():
             yield from _guarded(_type_problems(root, episode, site.name))
     for name, shape in listed.items():
         yield from map(Problem, shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
@@ -118,9 +118,9 @@ def _array_problems(
 
     @cache
     def whole(beside: str) -> NDArray[Any]:
-        if beside in wrong:
-            raise CorruptEpisode(f"{beside} does not fit the episode")
         site, _, kind = beside.partition("/")
+        if (f"{site}/atoms" if kind == "row_sum" else beside) in wrong:
+            raise CorruptEpisode(f"{beside} does not fit the episode")
         if kind == "row_sum":  # without a search for missing values: other masses of the replan may be no numbers
             return np.asarray(episode.read_stored(f"{site}/atoms", 0, episode.attributes.num_replans)[..., -1])
         return episode.uniform(site) if kind == "uniform" else episode.read(beside)

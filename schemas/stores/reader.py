@@ -26,6 +26,7 @@ from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.precision import is_half
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource
+from vla_attention.schemas.stores.content_rules import shape_problems, site_shapes
 from vla_attention.schemas.stores.outcomes import LaterOutcome, read_outcomes
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import NAMES_FILE, attributes_in, list_episodes, read_run, unlisted_episodes
@@ -151,7 +152,7 @@ class StoredEpisode:
         return {}
 
     @cached_property
-    def _once(self) -> dict[str, NDArray[Any]]:
+    def _kept(self) -> dict[str, NDArray[Any]]:
         return {}
 
     def has(self, name: str) -> bool:
@@ -203,15 +204,19 @@ class StoredEpisode:
         values = self.values_of(name, self.read_stored(name, chosen.start, chosen.stop))
         return values[0] if isinstance(index, int) else values
 
-    def read_once(self, name: str) -> NDArray[Any]:
+    def keep(self, name: str) -> NDArray[Any]:
         """As `read`, of a small array that several need; kept until `forget` is called, and not to be changed."""
-        if name not in self._once:
-            self._once[name] = self.read(name)
-        return self._once[name]
+        if name not in self._kept:
+            self._kept[name] = self.read(name)
+        return self._kept[name]
+
+    def read_kept(self, name: str) -> NDArray[Any]:
+        """What `keep` has kept of an array; read where that is nothing."""
+        return self._kept[name] if name in self._kept else self.read(name)
 
     def forget(self) -> None:
-        """Let go of what `read_once` has kept."""
-        self._once.clear()
+        """Let go of what `keep` has kept."""
+        self._kept.clear()
 
     def read_stored(self, name: str, first: int, stop: int) -> NDArray[Any]:
         """Numbers of one array as they are stored, from one index along the first axis to another; see `values_of`."""
@@ -271,7 +276,7 @@ class StoredEpisode:
 
     def row_sum(self, site: str) -> NDArray[np.float32]:
         """Sums of the rows as they were computed, (replan, layer, denoise, head, query)."""
-        return np.asarray(self.read_once(f"{site}/atoms")[..., -1])
+        return np.asarray(self.read_kept(f"{site}/atoms")[..., -1])
 
     def uniform(self, site: str) -> NDArray[np.float32]:
         """What uniform attention gives in the place of each row, with the axes of `SITE/rows`.
@@ -289,7 +294,7 @@ class StoredEpisode:
         return uniform_of_roles(self.read(f"{site}/key_role"))[:, None, None, None, None].astype(np.float32)
 
     def check_rows(self, root: RootAttributes, site: str) -> None:
-        """Raise `CorruptEpisode` when the rows of a site are not stored as float16 or float32 as their precision is."""
+        """Raise `CorruptEpisode` when rows and masses of a site have another type or shape than the run says."""
         stored, bits = self.array(f"{site}/rows").metadata, root.recording.mantissa_bits
         if stored.is_half is not is_half(bits) or f"{site}/row_sum" in self.attributes.arrays:
             raise CorruptEpisode(
@@ -297,6 +302,12 @@ class StoredEpisode:
                 f"{'float16' if is_half(bits) else 'float32'}, and its sums behind {site}/atoms. A store of before 30 "
                 "November 2026 is brought up to date by: python scripts/convert_store.py STORE (in the repository)."
             )
+
+        segments = len(self.attributes.segments.get(site, ()))
+        shapes = site_shapes(root.site(site), root.recording_of(site), self.attributes.num_replans, segments)
+        for name in (f"{site}/rows", f"{site}/atoms"):
+            for problem in shape_problems(name, self.shape_of(name), shapes[name]):
+                raise CorruptEpisode(f"Episode {self.name} cannot be read: {problem}.", f"{name}/zarr.json")
 
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""

@@ -85,7 +85,9 @@ def test_what_is_no_probability_is_not_stored_and_not_in_range():
     for value in (np.nan, np.inf, 1.99, 2.0, -1e-9, 1e38):
         with np.errstate(over="ignore"), pytest.raises(ValueError, match="above 1"):
             to_stored(np.array([0.5, value], np.float32), HALF_MANTISSA_BITS)
-    assert to_stored(np.array([1, 1.989], np.float32), HALF_MANTISSA_BITS).dtype == np.float16
+    stored = to_stored(np.array([1, 1.989, -0.0], np.float32), HALF_MANTISSA_BITS)
+    assert stored.dtype == np.float16
+    assert not np.signbit(stored).any()
 
 
 def test_tiny_probabilities_are_read_where_subnormal_numbers_are_taken_for_zero():

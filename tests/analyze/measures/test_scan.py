@@ -11,6 +11,8 @@ import pytest
 
 from tests.kit.questions import question_about
 from tests.kit.stores import StoreSpec, write_store
+from vla_attention.analyze.core.camera_maps import episode_maps
+from vla_attention.analyze.core.labelled_arrays import rows_of_episodes
 from vla_attention.analyze.core.levels import look_at_groups
 from vla_attention.analyze.core.measure import look_at
 from vla_attention.analyze.core.recorded_effects import selected_items
@@ -20,7 +22,10 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import Look, OnDisk, scan
 from vla_attention.schemas.errors import BadArgument
 
-SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=5, prompts="same", frames=False)
+#: Seven heads and all queries: means of means would differ in the last bits.
+SPEC = StoreSpec(
+    tasks=(0, 1), episodes=2, replans=5, prompts="same", frames=False, heads=tuple(range(7)), queries="all"
+)
 
 
 @pytest.fixture
@@ -78,6 +83,15 @@ def test_what_one_look_has_in_the_cache_is_not_read_for_it(question, scanned, mo
     again = scan(question, looks_of(question))
     assert scanned == []
     assert all(all(map(same, *pair)) for pair in zip(again, together, strict=True))
+
+
+def test_nothing_that_was_read_of_an_episode_stays(question, monkeypatch):
+    monkeypatch.setenv("VLA_CACHE", "off")
+    scan(question, looks_of(question))
+    assert len(list(rows_of_episodes(question))) == 4
+    for item in question.selected:
+        episode_maps(question, item, ("base_0_rgb",))
+        assert not vars(item.episode).get("_kept")
 
 
 def test_members_lie_on_disk_and_are_made_at_every_access(monkeypatch, tmp_path):

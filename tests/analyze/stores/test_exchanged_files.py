@@ -13,7 +13,7 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import attacks, edit_root, first, flip_bit, root_leaves
-from tests.kit.stores import StoreSpec, reseal_root, write_store
+from tests.kit.stores import StoreSpec, every_key_seen, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
@@ -25,7 +25,7 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import verify_store
 
 #: Both episodes of a task have arrays of the same shapes; rows are in three blocks.
-SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same", plant_uniform=every_key_seen)
 ARRAYS = (
     *(f"joint/{name}" for name in ("atoms", "contribution", "key_role", "rows", "uniform")),
     *(f"{kind}/{camera}" for kind in ("frames", "objects") for camera in ("base_0_rgb", "left_wrist_0_rgb")),

@@ -103,7 +103,7 @@ STORABLE: dict[str, tuple[Change, str]] = {
     ),
     "rows that sum to 2": (
         doubled,
-        r"joint/row_sum is 2 .*1 .*0\.001\) at replan 1, denoise step 9, layer 4, head 5",
+        r"joint/(row_sum|atoms) is 2 .*1 .*0\.001\) at replan 1, denoise step 9, layer 4, head 5",
     ),
     "mass for padding": (
         rows_with(rows=mass_to_padding),

@@ -203,3 +203,31 @@ def test_a_store_without_its_episodes_group(path):
     shutil.rmtree(path / "episodes")
     with pytest.raises(StoreError):
         open_store(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "cut"),
+    [
+        ("joint/rows", lambda values: values[..., 1:]),
+        ("joint/rows", lambda values: values[:, :, :, :1]),
+        ("joint/atoms", lambda values: values[1:]),
+        ("joint/atoms", lambda values: values[..., 1:]),
+        ("joint/atoms", lambda values: values.reshape(-1)),
+    ],
+    ids=["rows of fewer keys", "rows of fewer heads", "masses of fewer replans", "of fewer segments", "of one axis"],
+)
+def test_rows_and_masses_of_another_shape_are_refused(path, name, cut):
+    """Arrays that somebody else wrote and sealed, with attributes that say so."""
+    folder = path / "episodes/task001_episode000"
+    values = np.ascontiguousarray(cut(zarr.open_array(folder / name)[...]))
+    shutil.rmtree(folder / name)
+    scale = {"scale_factor": 2.0**-15} if values.dtype == np.float16 else {}
+    write_array(folder / name, values, chunks=values.shape, attributes=scale)
+    document = json.loads((folder / "zarr.json").read_text())
+    document["attributes"]["arrays"][name]["shape"] = list(values.shape)
+    (folder / "zarr.json").write_text(json.dumps(document))
+    reseal(folder)
+    store = open_store(path)
+    with pytest.raises(CorruptEpisode, match=rf"task001_episode000 .*{name} has the shape"):
+        store.episodes[0].tokens(store.attributes, "joint")
+    assert any(name in fault.problem for fault in verify_store(store, "values"))
