@@ -29,7 +29,7 @@ class RecordingSettings:
     )
     mantissa_bits: int = option(
         "mantissa bits kept of each probability, or 'exact' (default: %(default)s, which bounds the error of every "
-        "ratio by 0.1 %%)",
+        "ratio by 0.2 %%)",
         DEFAULT_MANTISSA_BITS,
         name="precision",
         type=str,
