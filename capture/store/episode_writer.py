@@ -119,12 +119,13 @@ class EpisodeWriter:
         self.durable = durable
         self.name = episode_name(start.task_id, start.episode_index)
         self.what = f"episode {self.name} of {store}"
-        self.group = zarr.create_group(UnpublishedFolder(folder), zarr_format=3)
         self.digests: dict[str, ArrayRecord] = {}
-        self.sites = {
-            site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site))
-            for site in run.sites
-        }
+        with self._as_its_holder():
+            self.group = zarr.create_group(UnpublishedFolder(folder), zarr_format=3)
+            self.sites = {
+                site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site))
+                for site in run.sites
+            }
         self.prompts: dict[Prompt, int] = {}
         self.records: list[ReplanRecord] = []
 

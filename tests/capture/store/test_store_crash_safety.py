@@ -32,6 +32,7 @@ from tests.kit.stores import (
     write_episode,
 )
 from tests.kit.thorough import thorough_except
+from vla_attention.capture.store import episode_writer
 from vla_attention.capture.store.episode_writer import EpisodeTaken, StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.capture.store.unpublished import UnpublishedFolder
@@ -270,6 +271,33 @@ def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, u
             open_run(path, root_attributes(SPEC), "overwrite")
     assert not path.exists()
     assert store_bytes(write_store(path, mode="overwrite", spec=SPEC)) == uninterrupted
+
+
+@pytest.mark.parametrize("committed", [True, False])
+def test_a_holder_that_stood_still_before_its_first_file_lost_the_episode(tmp_path, monkeypatch, committed):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC)
+    start, _ = episode_records(SPEC, 6, 0)
+    name, create = episode_name(6, 0), episode_writer.zarr.create_group
+    stopped, other = (open_run(path, root_attributes(SPEC), "resume") for _ in range(2))
+
+    def late(*given, **settings):
+        monkeypatch.setattr(episode_writer.zarr, "create_group", create)
+        os.utime(path / ".writing" / f"{name}.lock", (1000, 1000))
+        assert other.locks.acquire(name) is None
+        if committed:
+            write_episode(other, SPEC, 6, 0)
+        return create(*given, **settings)
+
+    monkeypatch.setattr(episode_writer.zarr, "create_group", late)
+    with (
+        pytest.raises(StoreExists if committed else EpisodeTaken),
+        stopped.episode(start, denoise_times(SPEC)),
+    ):
+        pytest.fail("the episode was begun")
+    other.locks.release(name)
+    assert verify_store(open_store(path)) == []
+    assert (names(path)[-1] == name) is committed
+    assert not leftovers(path)
 
 
 def test_a_holder_that_stood_still_neither_harms_its_successor_nor_publishes_half(tmp_path, uninterrupted):
