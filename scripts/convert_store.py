@@ -1,4 +1,4 @@
-"""Bring stores of before 29 November 2026 up to date: rows as float16 of p x 2^15, and seals with checksums of chunks.
+"""Bring stores of before 30 November 2026 up to date: rows as float16 of p x 2^15, and seals with checksums of chunks.
 
 Usage: python scripts/convert_store.py STORE.zarr|STORE.tar.xz [...]
 

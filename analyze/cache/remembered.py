@@ -12,17 +12,16 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import vla_attention
 from vla_attention.analyze.cache.kept_files import (
     ENDING,
-    Arrays,
     entries,
     kept_bytes,
     make_room,
@@ -117,6 +116,13 @@ class CachedQuestion:
         return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).digest()
 
 
+class _Slot(NamedTuple):
+    """Where the cache keeps the numbers of a question about an episode, and the digest of both."""
+
+    path: Path
+    key: bytes
+
+
 def remembered(
     questions: Sequence[CachedQuestion | None],
     episodes: Sequence[StoredEpisode],
@@ -147,15 +153,17 @@ def remembered(
     check_cache_place(place)
     room = place.most_bytes
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
-    keys: dict[tuple[int, int], bytes | None] = {}
+    slots: dict[tuple[int, int], _Slot] = {}
     missing = []
-    kept = {asked.digest: {one.name for one in entries(_folder(place, asked))} for asked in questions if asked}
+    kept = [{one.name for one in entries(_folder(place, asked))} if asked else set() for asked in questions]
     for i, episode in enumerate(episodes):
         state = file_state(episode) if any(questions[j] for j in of_episode[i]) else None
         for j in of_episode[i]:
             asked = questions[j]
-            keys[i, j] = None if asked is None or state is None else _key(asked, episode, state, arguments[j][i])
-        missing.append([j for j in of_episode[i] if not _is_kept(keys[i, j], questions[j], kept)])
+            if asked is not None and state is not None:
+                key = _key(asked, episode, state, arguments[j][i])
+                slots[i, j] = _Slot(_folder(place, asked) / f"{key.hex()[:32]}{ENDING}", key)
+        missing.append([j for j in of_episode[i] if (i, j) not in slots or slots[i, j].path.name not in kept[j]])
     wanted = [(i, of) for i, of in enumerate(missing) if of]
     if len(wanted) < len(episodes):
         progress(len(episodes) - len(wanted))
@@ -164,20 +172,19 @@ def remembered(
         for i in range(len(episodes)):
             found = dict(zip(missing[i], next(measured), strict=True)) if missing[i] else {}
             # Read when its turn comes: numbers of thousands of episodes would not fit into memory.
-            known = {j: _read(place, questions[j], keys[i, j]) for j in of_episode[i] if j not in found}
+            known = {j: read_arrays(*slots[i, j]) for j in of_episode[i] if j not in found}
             if damaged := [j for j, arrays in known.items() if arrays is None]:
                 found |= dict(zip(damaged, next(iter(measure([(i, damaged)]))), strict=True))
             for j, arrays in found.items():
-                asked, key = questions[j], keys[i, j]
-                if asked is None or key is None:
+                if (slot := slots.get((i, j))) is None:
                     continue
-                content = kept_bytes(key, arrays)
+                content = kept_bytes(slot.key, arrays)
                 # A question that alone is larger than the cache keeps its first episodes: dropping them for later
                 # ones would leave nothing for the next time.
                 room -= len(content)
                 try:
                     if room >= 0:
-                        write_file(_folder(place, asked) / _file(key), content)
+                        write_file(slot.path, content)
                 except OSError:
                     room = -1  # no room on the disk, or a folder that others own
             yield {j: found[j] if j in found else known[j] for j in of_episode[i]}
@@ -188,18 +195,6 @@ def remembered(
 
 def _folder(place: CachePlace, question: CachedQuestion) -> Path:
     return place.folder / question.digest.hex()[:32]
-
-
-def _file(key: bytes) -> str:
-    return f"{key.hex()[:32]}{ENDING}"
-
-
-def _is_kept(key: bytes | None, question: CachedQuestion | None, kept: Mapping[bytes, Container[str]]) -> bool:
-    return key is not None and question is not None and _file(key) in kept[question.digest]
-
-
-def _read(place: CachePlace, question: CachedQuestion | None, key: bytes | None) -> Arrays | None:
-    return None if question is None or key is None else read_arrays(_folder(place, question) / _file(key), key)
 
 
 def _key(question: CachedQuestion, episode: StoredEpisode, state: bytes, arguments: Any) -> bytes:

@@ -17,7 +17,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.measure import look_at, table_of
-from vla_attention.analyze.core.object_shares import ALL_CAMERAS, cameras_of, look_at_objects, object_times
+from vla_attention.analyze.core.object_shares import ALL_CAMERAS, look_at_objects, object_times, positions_with_coverage
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.scan import scan
@@ -249,7 +249,7 @@ def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataF
     if not items:
         return found
     part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
-    having = [i for i, item in enumerate(part.selected) if cameras_of(item)]
+    having = positions_with_coverage(part)
     objects = [look_at_objects(part, positions=having)] if having else []
     words, *rest = scan(part, [look_at(part, items_of), *objects])
     lifts = table_of(words, {"replan"}).filter(pl.col("kind") == "word").collect()

@@ -175,9 +175,8 @@ def replan_cells(one: Measured, grouping: Grouping) -> pl.DataFrame:
     if grouping.ratio is not None:
         values |= _of_whole_replans(values["ratio"], values["uniform_ratio"], list(one.selection.once))
         values = _relative(values)
-    fractions = ("numerator_fraction", "denominator_fraction")
     table = long_table(one.item, axes_of(one, by), values, EPISODE_KEYS).drop("denoise_step", "head")
-    return table.drop(fractions, strict=False)
+    return table.drop(_FRACTIONS, strict=False)
 
 
 def _cell_values(one: Measured, grouping: Grouping, by: Collection[str]) -> dict[str, NDArray[Any]]:

@@ -245,8 +245,8 @@ class _ItemMasses:
     def _masses(self) -> Array:
         """(replan, layer, denoise or 1, head or 1, item), those of `Items.with_totals`."""
         mass = masses(self.atoms, self.of_segments)
-        known = self.found[..., len(self.pairs) :] > 0
-        scale = self.atoms[..., self.whole] / np.where(known, self.found[..., len(self.pairs) :], np.inf)
+        of_rows = self.found[..., len(self.pairs) :]
+        scale = self.atoms[..., self.whole] / np.where(of_rows > 0, of_rows, np.inf)
         for at, (i, segment) in enumerate(self.pairs):
             mass[..., i] += self.found[..., at] * scale[..., self.whole.index(segment)]
         return mass if self.denoise else mass.mean(axis=2, keepdims=True)

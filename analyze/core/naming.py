@@ -37,9 +37,9 @@ from vla_attention.analyze.core.measure import Measured
 from vla_attention.analyze.core.object_maps import ObjectMaps, look_at_maps, over_place
 from vla_attention.analyze.core.object_shares import (
     ALL_CAMERAS,
-    cameras_of,
     look_at_objects,
     object_times,
+    positions_with_coverage,
     with_coverage,
 )
 from vla_attention.analyze.measures.masses import finite_mean
@@ -106,8 +106,8 @@ def naming(question: Question, measured: Sequence[Measured], found: Sequence[Obj
 
     Args:
         question: its episodes.
-        measured: their `measure_objects`.
-        found: their `object_maps`, heads and layers together.
+        measured: what `look_at_objects` found in them.
+        found: what `look_at_maps` found in them, heads and layers together.
     """
     cases = _cases(question)
     kinds = by_kind(cases.with_columns(camera=pl.lit(ALL_CAMERAS), x=pl.lit(0.0)))
@@ -147,7 +147,7 @@ class ObjectAttention:
 
 def looks_at_objects(question: Question) -> list[Look[Any]]:
     """The looks that `ObjectAttention` takes; none without object coverage."""
-    having = [i for i, item in enumerate(question.selected) if cameras_of(item)]
+    having = positions_with_coverage(question)
     if not having:
         return []
     maps = look_at_maps(question, heads=False, layers=False, iou=False, positions=having)

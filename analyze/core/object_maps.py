@@ -40,7 +40,7 @@ from vla_attention.analyze.core.pointing_and_iou import (
 )
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.scan import Look, scan
+from vla_attention.analyze.measures.scan import Look
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 from vla_attention.analyze.measures.tables import EPISODE_KEYS, Axis, head_axis, layer_axis, long_table, with_average
 from vla_attention.analyze.stores.rows import LayerRows
@@ -88,12 +88,6 @@ class ObjectMaps:
     area: NDArray[np.float32]
     num_patches: Mapping[str, int]
     axes: tuple[Axis, Axis, Axis]
-
-
-def object_maps(question: Question, heads: bool, layers: bool, iou: bool) -> Sequence[ObjectMaps]:
-    """The maps of every episode of a question `with_coverage`, see `look_at_maps`."""
-    (found,) = scan(question, [look_at_maps(question, heads, layers, iou)])
-    return found
 
 
 def look_at_maps(

@@ -13,7 +13,7 @@ from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.core.measure import Items, Measured, look_at, table_of
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.scan import Look, scan
+from vla_attention.analyze.measures.scan import Look
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.tables import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.schemas.errors import BadArgument
@@ -47,10 +47,15 @@ def with_coverage(question: Question) -> Question:
     Raises:
         BadArgument: no episode has object coverage at this site.
     """
-    showing = tuple(item for item in question.selected if cameras_of(item))
+    showing = positions_with_coverage(question)
     if not showing:
         raise BadArgument(f"Site '{question.site}': {NO_COVERAGE}.")
-    return replace(question, selected=showing)
+    return replace(question, selected=tuple(question.selected[i] for i in showing))
+
+
+def positions_with_coverage(question: Question) -> list[int]:
+    """Positions of the episodes whose pictures tell which objects they show."""
+    return [i for i, item in enumerate(question.selected) if cameras_of(item)]
 
 
 def names_of(item: SelectedEpisode) -> tuple[list[tuple[str, str, str]], NDArray[np.float32]]:
@@ -89,12 +94,6 @@ def items_of(item: SelectedEpisode) -> Items:
         weights[:, keys, first : first + len(names)] = covered(item, camera, members)
     columns = {name: pl.Series(name, [label[i] for label in labels], dtype=pl.String) for i, name in enumerate(ITEM)}
     return Items(columns, weights, len(cameras), absent="zero")
-
-
-def measure_objects(question: Question, by: Collection[str] = ()) -> Sequence[Measured]:
-    """The masses of `items_of` in every episode of a question `with_coverage`."""
-    (measured,) = scan(question, [look_at_objects(question, by)])
-    return measured
 
 
 def look_at_objects(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.groupings.key_counts import uniform_of_roles
+from vla_attention.schemas.groupings.key_counts import stored_uniform_of_roles
 
 Array = NDArray[np.float64]
 
@@ -39,8 +39,7 @@ def uniform_keys(item: SelectedEpisode, selection: Selection) -> Array:
     """
     episode, name = item.episode, f"{item.tokens.layout.name}/uniform"
     if not episode.has(name):
-        # Of float32, as it is where it is stored.
-        return uniform_of_roles(item.tokens.static_roles).astype(np.float32).astype(np.float64)[:, None, None, None]
+        return stored_uniform_of_roles(item.tokens.static_roles)[:, 0].astype(np.float64)
     _, layers, denoise, heads, _, _ = episode.shape_of(name)
     places = [
         (layer, step)

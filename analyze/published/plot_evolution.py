@@ -52,10 +52,8 @@ def evolution_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
 
 def _write(path: Path, levels: Levels, number: int, layer: str) -> None:
     measured, grouping = levels.measured[number], levels.grouping
-    rows, cells = (
-        means(measured, ("replan", "layer")),
-        replan_cells(measured, grouping).filter(layer=layer).sort("replan"),
-    )
+    cells = replan_cells(measured, grouping).filter(layer=layer).sort("replan")
+    rows = means(measured, ("replan", "layer"))
     groups = rows.filter(kind="group", layer=layer).rename({"share": "fraction"}).sort("replan")
     with Style().settings():
         path.write_bytes(Style().content(_draw(cells, groups, grouping), "png"))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import RowCodec, create_rows, keys_per_chunk, replans_per_block
 from vla_attention.capture.store.replan_records import RecordedRows
-from vla_attention.schemas.groupings.key_counts import uniform_of_roles
+from vla_attention.schemas.groupings.key_counts import stored_uniform_of_roles, uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, to_stored
@@ -193,7 +193,7 @@ class SiteWriter:
         uniforms = self._of_replans("uniform")
         cells = np.broadcast_shapes(*(uniform.shape for uniform in uniforms))
         uniform = np.stack([np.broadcast_to(of_replan, cells) for of_replan in uniforms])
-        if (uniform == uniform_of_roles(key_role)[:, None, None, None, None].astype(np.float32)).all():
+        if (uniform == stored_uniform_of_roles(key_role)).all():
             return {}
         for axis in range(uniform.ndim - 1):
             first = uniform.take([0], axis=axis)

@@ -34,3 +34,8 @@ def uniform_rows(seen: NDArray[np.bool_]) -> NDArray[np.float64]:
 def uniform_of_roles(key_role: NDArray[np.uint8]) -> NDArray[np.float64]:
     """u (..., key) of a policy whose action queries all see every key but the `UNSEEN_ROLES`, from role codes."""
     return uniform_rows(~np.isin(key_role, [int(role) for role in UNSEEN_ROLES]))
+
+
+def stored_uniform_of_roles(key_role: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """`uniform_of_roles` as `SITE/uniform` has it, (replan, 1, 1, 1, 1, key), from the codes (replan, key)."""
+    return uniform_of_roles(key_role)[:, None, None, None, None].astype(np.float32)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import Note, listing
 from vla_attention.schemas.fitted_pictures import border_of_keys
-from vla_attention.schemas.groupings.key_counts import uniform_of_roles
+from vla_attention.schemas.groupings.key_counts import stored_uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.layout import Prompt, prompt_at
@@ -291,7 +291,7 @@ class StoredEpisode:
 
     def uniform_of_roles(self, site: str) -> NDArray[np.float32]:
         """`uniform` where every query sees all keys whose roles let it see them, (replan, 1, 1, 1, 1, key)."""
-        return uniform_of_roles(self.read(f"{site}/key_role"))[:, None, None, None, None].astype(np.float32)
+        return stored_uniform_of_roles(self.read(f"{site}/key_role"))
 
     def check_rows(self, root: RootAttributes, site: str) -> None:
         """Raise `CorruptEpisode` when rows and masses of a site have another type or shape than the run says."""
@@ -302,7 +302,6 @@ class StoredEpisode:
                 f"{'float16' if is_half(bits) else 'float32'}, and its sums behind {site}/atoms. A store of before 30 "
                 "November 2026 is brought up to date by: python scripts/convert_store.py STORE (in the repository)."
             )
-
         segments = len(self.attributes.segments.get(site, ()))
         shapes = site_shapes(root.site(site), root.recording_of(site), self.attributes.num_replans, segments)
         for name in (f"{site}/rows", f"{site}/atoms"):

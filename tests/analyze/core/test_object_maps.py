@@ -13,7 +13,8 @@ from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import probabilities
 from tests.kit.tokens import random_rows
-from vla_attention.analyze.core.object_maps import object_maps, over_place
+from vla_attention.analyze.core.object_maps import look_at_maps, over_place
+from vla_attention.analyze.measures.scan import scan
 
 SIZE, REPLANS, EPISODES = 7, 2, (0, 1, 2)
 
@@ -73,7 +74,8 @@ def expected(arrays: dict, episode: int, layer: int, head: int, cameras: tuple[s
 
 def test_it_is_what_the_maps_get_at_the_places_of_the_other_episodes(store):
     question = question_about(store)
-    table = over_place(question, object_maps(question, heads=True, layers=True, iou=False))
+    (found,) = scan(question, [look_at_maps(question, heads=True, layers=True, iou=False)])
+    table = over_place(question, found)
     arrays = {task: [raw(store, task, episode) for episode in EPISODES] for task in (0, 1)}
     things = [thing.name for thing in question.selected[0].tokens.objects]
     own = table.filter(kind="object").filter(pl.col("layer") != "layers_avg")
@@ -94,6 +96,7 @@ def test_the_same_episode_three_times_has_exactly_its_place(tmp_path):
 
     path = write_bowl_store(tmp_path / "a.zarr", tokens=bowl_tokens(REPLANS, SIZE), episodes=3, plant_rows=plant)
     question = question_about(path)
-    table = over_place(question, object_maps(question, heads=False, layers=False, iou=False))
+    (found,) = scan(question, [look_at_maps(question, heads=False, layers=False, iou=False)])
+    table = over_place(question, found)
     assert table.height > 0
     assert (table["at_place"] == table["elsewhere"]).all()
