@@ -6,14 +6,14 @@ beside it, for the wanted queries only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal
 
 import torch
+from msgspec import Struct
 from torch import Tensor
 
 from vla_attention.capture.torch_policies.output_ways import OutputWay
@@ -42,8 +42,7 @@ class RowsRefused(BadArgument):
     """Rows were wanted of an attention call whose keys or heads are not those that a layout can name."""
 
 
-@dataclass(frozen=True)
-class CallShape:
+class CallShape(Struct, frozen=True):
     """What is known before the kernel of a call runs.
 
     Attributes:
@@ -64,6 +63,12 @@ class CallShape:
     queries: int
     keys: int
     dtype: str
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """Torch's own name of the dtype."""
+        dtype: torch.dtype = getattr(torch, self.dtype)
+        return dtype
 
     def __str__(self) -> str:
         heads = f"{self.heads} heads" if self.heads == self.kv_heads else f"{self.heads}/{self.kv_heads} heads"
@@ -133,7 +138,7 @@ class AttentionCall:
     @property
     def precision(self) -> str:
         """The least precise dtype of what is multiplied and of its result: a softmax may be of higher precision."""
-        dtypes = [self.value.dtype, self.output.dtype, getattr(torch, self.shape.dtype)]
+        dtypes = [self.value.dtype, self.output.dtype, self.shape.torch_dtype]
         dtypes += [] if self.multiplied is None else [self.multiplied]
         return str(max(dtypes, key=lambda dtype: torch.finfo(dtype).eps)).removeprefix("torch.")
 
@@ -190,17 +195,17 @@ def refuse_rows(shape: CallShape, why: str) -> None:
 class Watcher:
     """Is told about every attention call of a watched block, in order. This one takes and changes nothing.
 
-    changes: whether it is asked for changes at all. modules: the ids of the policy's modules that ran. unmet: softmaxes
-    that met no values, and the last function that their result was followed to.
+    changes: whether it is asked for changes at all. whole: whether every function of the block is watched; see
+    `WatchedPlaces`. number: of the block among those of its kind that computed attention, from 0. modules: after the
+    block, the ids of the policy's modules that ran. unmet: softmaxes that met no values, and the last function that
+    their result was followed to.
     """
 
     changes: Any = False
+    whole: bool = True
+    number: int = 0
+    modules: Set[int] = frozenset()
     unmet: Mapping[int, tuple[CallShape, str]] = MappingProxyType({})
-
-    @cached_property
-    def modules(self) -> set[int]:
-        """See above."""
-        return set()
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return logits to add before the softmax, broadcastable to (batch, head, query, key), or None for no change.

@@ -6,7 +6,7 @@ What does not fit is kept and raised at the end of the replan, so that the error
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -62,14 +62,30 @@ class KnownCalls:
         queries: of a site and a number of queries, the action queries; errors as `RecordedSite.queries`.
         keys: of a site, a number of keys and a number of tokens generated before, the site's keys of such a call, and
             the length of its variable span; instead of the keys, what does not fit.
+        compared: shapes of calls, without their numbers, of which rows were compared with what the kernel gave.
+        sums: by site and block, which of the sums with what attention gave is the residual stream, from 1; where it
+            was the same one in all calls that were watched throughout.
     """
 
     def __init__(self, layout: PolicyLayout) -> None:
         self.layout = layout
         self.sites = {site.name: site for site in layout.sites}
+        self.compared: set[CallShape] = set()
+        self.sums: dict[tuple[str, int], int] = {}
+        self._unlike: set[tuple[str, int]] = set()
         self.blocks = {site.name: site.keys.layers or tuple(range(layout.num_layers)) for site in layout.sites}
         self.rule, self.keys = cache(self._rule), cache(self._keys)
         self.queries = cache(lambda site, count: slice(*self.sites[site].queries(count)))
+
+    def learn_sums(self, sums: Mapping[tuple[str, int], int | None]) -> None:
+        """Keep which sums were the stream in a call that was watched throughout; None: it is not known."""
+        for block, number in sums.items():
+            if number is None or self.sums.get(block, number) != number:
+                self._unlike.add(block)
+            else:
+                self.sums[block] = number
+        for block in self._unlike:
+            self.sums.pop(block, None)
 
     def _rule(self, module: str, kind: str, queries: int, keys: int) -> tuple[int, int | None]:
         for number, rule in enumerate(self.layout.rules):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.interventions.factors import check_keys_left
-from vla_attention.capture.torch_policies.attention_calls import MASK_DISTANCE, MASKED_BELOW, CallShape
+from vla_attention.capture.torch_policies.attention_calls import MASK_DISTANCE, MASKED_BELOW, NO_MASS, CallShape
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -53,6 +55,97 @@ def visible(logits: Tensor) -> Tensor | None:
         return None
     near = (logits > highest - MASK_DISTANCE) & (highest > MASKED_BELOW)
     return (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW) & near.any(dim=1, keepdim=True)
+
+
+@dataclass(frozen=True)
+class SeenKeys:
+    """Which keys the queries of a call see by its mask.
+
+    Attributes:
+        keys: (batch, head or 1, query, key) bool.
+        added: what the mask adds to logits, in axes that can be broadcast to theirs; None for nothing.
+        every_query: whether it is known that each of them sees a key.
+    """
+
+    keys: Tensor
+    added: Tensor | None
+    every_query: bool
+
+
+class Masks:
+    """The masks of one watched block: most of its calls have the same one."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Any, ...], tuple[Tensor | None, SeenKeys]] = {}
+        #: By the shape of rows: (batch, query, key) bool, which keys had mass for some head, and which are seen.
+        self._by_mass: dict[torch.Size, tuple[Tensor, Tensor]] = {}
+
+    def seen(
+        self, mask: Tensor | None, causal: bool, queries: slice, sizes: tuple[int, int, int], device: torch.device
+    ) -> SeenKeys:
+        """Return what queries of a call see.
+
+        Args:
+            mask: (batch or 1, head or 1, query or 1, key) of these queries, bool (True: seen) or added to logits.
+            causal: whether `is_causal` hides keys too.
+            queries: which ones of the call.
+            sizes: batch, queries and keys of the call.
+            device: of the call.
+        """
+        shape = None if mask is None else (mask.shape, mask.dtype)
+        key = (shape, causal, queries.start, queries.stop, queries.step, sizes, device)
+        if device.type != "cpu":  # comparing would wait for it
+            return _seen(mask, causal, queries, sizes, device)
+        before, known = self._known.get(key, (None, None))
+        if known is None or (mask is not None and before is not None and not torch.equal(mask, before)):
+            known = _seen(mask, causal, queries, sizes, device)
+            self._known[key] = None if mask is None else mask.clone(), known
+        return known
+
+    def seen_by(self, rows: Tensor, shown: Tensor, sinks: int, *, alike: bool) -> Tensor:
+        """Return the keys that queries see, (batch, head or 1, query, key) bool, of a softmax by hand.
+
+        Args:
+            rows: its probabilities, (batch, head, query, key).
+            shown: its logits without the last `sinks` keys, or which keys are seen.
+            sinks: keys of the softmax without values, which are seen.
+            alike: keys are taken for seen as in an earlier call of the block in which the same ones had mass.
+        """
+        massive = None
+        if alike and rows.device.type == "cpu":
+            massive = (rows > NO_MASS).any(dim=1)
+            before, known = self._by_mass.get(rows.shape, (None, None))
+            if known is not None and before is not None and torch.equal(massive, before):
+                return known
+        seen = shown if shown.dtype is torch.bool else visible(shown)
+        if seen is None:
+            seen = torch.ones((), dtype=torch.bool, device=rows.device).expand(rows.shape[0], 1, *rows.shape[2:])
+        elif sinks:
+            seen = torch.nn.functional.pad(seen, (0, sinks), value=True)
+        if massive is not None:
+            self._by_mass[rows.shape] = massive, seen
+        return seen
+
+
+def _seen(
+    mask: Tensor | None, causal: bool, queries: slice, sizes: tuple[int, int, int], device: torch.device
+) -> SeenKeys:
+    batch, count, keys = sizes
+    numbers = torch.arange(count, device=device)[queries]
+    seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=device)
+    below = causal_mask(numbers, keys) if causal else None
+    hidden, added = None if below is None else ~below, None
+    if mask is not None and mask.dtype is torch.bool:
+        hidden = ~mask if hidden is None else ~mask | hidden
+    elif mask is not None:
+        added, unmasked = mask, visible(mask)
+        seen = seen if unmasked is None else seen & unmasked
+    if hidden is not None:
+        seen = seen & ~hidden
+        masked = torch.zeros(hidden.shape, device=device).masked_fill_(hidden, float("-inf"))
+        added = masked if added is None else added + masked
+    alone = added is None or (device.type == "cpu" and not bool((added.amax(-1) == float("-inf")).any()))
+    return SeenKeys(seen, added, alone)
 
 
 def check_change(before: Tensor, after: Tensor, shape: CallShape) -> None:

@@ -7,20 +7,20 @@ Run eager, it applies the mask function to every key, whatever the blocks say.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from msgspec import Struct, structs
 from torch import Tensor, nn
 from torch._higher_order_ops.flex_attention import flex_attention as flex_operator
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.attention.bias import CausalBias
 
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_tensors import (
+    SeenKeys,
     batch_and_heads,
-    causal_mask,
     changed_mask,
     check_change,
     fitted_change,
@@ -46,8 +46,7 @@ _ANY_KERNEL = [
 ]  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _SdpaArguments:
+class _SdpaArguments(Struct, frozen=True):
     query: Tensor
     key: Tensor
     value: Tensor
@@ -66,63 +65,69 @@ def watch_sdpa(
     query, key = given.query, given.key
     mode.refuse_without_numbers(query, key)
     if isinstance(given.attn_mask, CausalBias):  # it has no numbers of its own
-        given = replace(given, attn_mask=given.attn_mask._materialize(query.device))
-    dtype = query.dtype
-    if torch.is_autocast_enabled(query.device.type):
-        dtype = torch.get_autocast_dtype(query.device.type)
-    path, module = mode.where()
-    lead, kernel_queries, dim = _lead(given), query.shape[-2], query.shape[-1]
-    keys = key.shape[-2]
-    batch, kernel_heads = batch_and_heads(lead, module)
-    kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
-    group = _packed_heads(module, query, key)
-    heads, queries = kernel_heads * group, kernel_queries // group
-    shape = mode.new_shape(path, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
-    mask = None
-    if given.attn_mask is not None:
+        given = structs.replace(given, attn_mask=given.attn_mask._materialize(query.device))
+
+    def find_out() -> tuple[CallShape, tuple[list[int], int, int]]:
+        dtype = query.dtype
+        if torch.is_autocast_enabled(query.device.type):
+            dtype = torch.get_autocast_dtype(query.device.type)
+        path, module = mode.where()
+        lead, keys = _lead(given), key.shape[-2]
+        batch, kernel_heads = batch_and_heads(lead, module)
+        kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
+        group = _packed_heads(module, query, key)
+        sizes = (batch, kernel_heads * group, kv_heads, query.shape[-2] // group, keys)
+        return mode.new_shape(path, "sdpa", sizes, dtype), (lead, kernel_heads, group)
+
+    shapes = (query.shape, key.shape, given.value.shape, None if given.attn_mask is None else given.attn_mask.shape)
+    kind = ("sdpa", *shapes, given.enable_gqa, query.dtype, torch.is_autocast_enabled(query.device.type))
+    shape, (lead, kernel_heads, group) = mode.facts(kind, find_out)
+    batch, heads, queries, keys = shape.batch, shape.heads, shape.queries, shape.keys
+    kernel_queries, dim = query.shape[-2], query.shape[-1]
+
+    def folded_mask() -> Tensor | None:
+        if given.attn_mask is None:
+            return None
         mask = _folded_mask(given.attn_mask.detach(), lead, batch, kernel_heads)
         if group > 1 and mask.shape[1:3] != (1, 1):
             mask = mask.expand(-1, kernel_heads, kernel_queries, -1).reshape(-1, heads, queries, mask.shape[-1])
+        return mask
+
     change = mode.change(shape)
     if change is None:
         output = function(*args, **kwargs)
     else:
         change = fitted_change(change, shape, query.device)
-        before, after = changed_mask(mask, given.is_causal, change, queries, keys)
+        before, after = changed_mask(folded_mask(), given.is_causal, change, queries, keys)
         check_change(before, after, shape)
         # As the kernel wants it: as many axes as its queries have.
-        logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(dtype)
+        logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(shape.torch_dtype)
         options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
         with sdpa_kernel(_ANY_KERNEL):
             output = function(query, key, given.value, logits, given.dropout_p, **options)
     if mode.passes(shape):
         return output
+    mask, dtype = folded_mask(), shape.torch_dtype
     folded_query = query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim)
     folded_key, values = (
-        _folded(tensor.to(dtype), lead, batch, kv_heads) for tensor in (key, given.value)
+        _folded(tensor.to(dtype), lead, batch, shape.kv_heads) for tensor in (key, given.value)
     )  # fmt: skip
     scale = dim**-0.5 if given.scale is None else given.scale
 
-    def rows_of(wanted: slice, rows: slice) -> Tensor:
-        logits = query_key_logits(folded_query[rows, :, wanted], folded_key[rows], scale)
-        if mask is not None:
-            seen = part(mask, wanted, rows)
-            logits = logits.masked_fill_(~seen, float("-inf")) if seen.dtype is torch.bool else logits.add_(seen)
-        if given.is_causal:
-            numbers = torch.arange(queries, device=logits.device)[wanted]
-            logits.masked_fill_(~causal_mask(numbers, keys), float("-inf"))
-        return normalised(logits if change is None else logits.add_(part(change, wanted, rows)))
+    def seen_of(wanted: slice, rows: slice) -> SeenKeys:
+        given_mask, size = None if mask is None else part(mask, wanted, rows), len(range(*rows.indices(batch)))
+        return mode.masks.seen(given_mask, given.is_causal, wanted, (size, queries, keys), query.device)
 
-    def allowed_of(wanted: slice) -> Tensor:
-        numbers = torch.arange(queries, device=query.device)[wanted]
-        seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=query.device)
-        if mask is not None:
-            chosen = part(mask, wanted, slice(None))
-            unmasked = chosen if chosen.dtype is torch.bool else visible(chosen)
-            seen = seen if unmasked is None else seen & unmasked
-        return seen & causal_mask(numbers, keys) if given.is_causal else seen
+    def rows_of(wanted: slice, rows: slice) -> Tensor:
+        logits, seen = query_key_logits(folded_query[rows, :, wanted], folded_key[rows], scale), seen_of(wanted, rows)
+        if seen.added is not None:
+            logits.add_(seen.added)
+        if change is not None:
+            return normalised(logits.add_(part(change, wanted, rows)))
+        return torch.softmax(logits, dim=-1).float() if seen.every_query else normalised(logits)
 
     folded = output.detach().reshape(batch, heads, queries, given.value.shape[-1])
+    allowed_of = lambda wanted: seen_of(wanted, slice(None)).keys  # noqa: E731
     mode.saw(AttentionCall(shape, values, folded, rows_of, allowed_of, lambda mixed: mixed.reshape(output.shape)))
     return output
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from typing import Any
 
+from msgspec import structs
 from torch import Tensor
 
 from vla_attention.capture.policies.random_numbers import RandomNumbers
@@ -98,14 +99,14 @@ class CallTable:
         # Of each module and shape: number of keys -> the checks of its calls.
         counts: dict[CallShape, dict[int, list[_Check]]] = {}
         for call, check in zip(self.calls, checks, strict=True):
-            counts.setdefault(replace(call, number=0, keys=0), {}).setdefault(call.keys, []).append(check)
+            counts.setdefault(structs.replace(call, number=0, keys=0), {}).setdefault(call.keys, []).append(check)
         folded: dict[tuple[Any, ...], list[tuple[CallShape, list[_Check]]]] = {}
         for shape, by_keys in counts.items():
             ranges = {(keys, keys): found for keys, found in by_keys.items()}
             # A module with many numbers of keys, such as a decoder with a cache, gets one row.
             if len(by_keys) >= _RANGE:
                 ranges = {(min(by_keys), max(by_keys)): list(chain.from_iterable(by_keys.values()))}
-            pattern = replace(shape, module=re.sub(r"\d+", "{}", shape.module))
+            pattern = structs.replace(shape, module=re.sub(r"\d+", "{}", shape.module))
             for keys, found in ranges.items():
                 folded.setdefault((pattern, keys, any(why for _, why in found)), []).append((shape, found))
         return tuple(_row(keys, modules) for (_, keys, _), modules in folded.items())

@@ -26,6 +26,19 @@ from vla_attention.capture.torch_policies.tensor_table import TensorTable, tenso
 #: Numbers in the axes of a call's result -> what the policy made of them, float32.
 Replay = Callable[[Tensor], Tensor]
 
+
+@dataclass(frozen=True)
+class Projected:
+    """A replay that is one linear layer and folds: of an output (batch, query, head · dim) it gives weight · output.
+
+    weight: (width, head · dim), None before the layer. bias: (width,). gate: what that is multiplied with afterwards.
+    """
+
+    weight: Tensor | None = None
+    bias: Tensor | None = None
+    gate: Tensor | None = None
+
+
 #: Functions by their names without underscores: those of the same numbers, whatever their precision and device.
 _COPIES = {
     "to", "type", "type_as", "float", "half", "bfloat16", "double", "contiguous", "clone", "detach", "cpu", "cuda",
@@ -36,6 +49,11 @@ _FOLDS = {
     "permute", "movedim", "t", "get", "view_as", "reshape_as", "expand", "expand_as", "repeat", "repeat_interleave",
     "chunk", "split", "unbind", "narrow", "select", "index_select", "getitem", "flip", "roll", "gather",
     "take_along_dim",
+}  # fmt: skip
+#: Those that keep every number, and each once.
+_ARRANGES = {
+    "view", "reshape", "flatten", "unflatten", "ravel", "squeeze", "unsqueeze", "transpose", "swapaxes", "swapdims",
+    "permute", "movedim", "view_as", "reshape_as",
 }  # fmt: skip
 #: What is replayed in their place: the output of the replay may lie otherwise in memory than the call's.
 _RESHAPES = {"view": Tensor.reshape, "view_as": Tensor.reshape_as}
@@ -96,8 +114,11 @@ class OutputWay:
     """The output of one attention call, to be followed to the residual stream.
 
     Attributes:
-        take: until the stream is found, makes of a replay, and of what the policy added, what is kept of it, and
-            whether the recorded queries are in it. It raises `NotReplayed` where the two differ.
+        take: until the stream is found, makes of a replay, of its `Projected` (or None), and of what the policy added,
+            what is kept of it, and whether the recorded queries are in it. It raises `NotReplayed` where the two
+            differ.
+        expected: the number of the sum that was the stream in calls like this one, beyond which nothing is followed;
+            None: not known.
         taken: what was kept, of each sum that may be the residual stream.
         nothing: what was kept where the recorded queries are not in a sum: other tokens', or behind a gate of 0.
         lost: why it is not known what is added; "" where nothing stands against it.
@@ -111,7 +132,8 @@ class OutputWay:
         dtypes: of all that is followed.
     """
 
-    take: Callable[[Replay, Tensor], tuple[Any, bool]] | None
+    take: Callable[[Replay, Projected | None, Tensor], tuple[Any, bool]] | None
+    expected: int | None = None
     taken: list[_Taken] = field(default_factory=list, init=False)
     nothing: Any = field(default=None, init=False)
     lost: str = field(default="", init=False)
@@ -168,6 +190,7 @@ class _Step:
         projected: whether a matrix product stands on its way, from the last sum on.
         factor: whether it is made of numbers such as those by which a norm divides.
         stacked: how many numbers each of the tensors has that stand beside one another in it; 0 where none do.
+        projected_by: the replay as one linear layer, where it is that.
         goes_on: whether it is the last of the sums behind norms, or written into another tensor.
     """
 
@@ -178,6 +201,7 @@ class _Step:
     factor: bool = False
     goes_on: bool = False
     stacked: int = 0
+    projected_by: Projected | None = None
 
 
 _Steps = Sequence[tuple[Tensor, _Step]]
@@ -197,7 +221,7 @@ class OutputWays:
 
     def begin(self, way: OutputWay, result: Tensor) -> None:
         """Follow the output of a call that has just run; result: what the policy got of it."""
-        self._put([result], way, _Step(lambda given: given))
+        self._put([result], way, _Step(lambda given: given, projected_by=Projected()))
 
     def note_other_use(self, way: OutputWay, probabilities: Sequence[Tensor]) -> None:
         """Follow the probabilities of a call too: keys give more through them than through the call's output."""
@@ -245,9 +269,11 @@ class OutputWays:
                 stacked = steps[0][1].stacked if call.name in _FOLDS else 0
                 if call.name in _STACKS and len(list(used_tensors(call.name, call.args, call.kwargs))) > len(steps):
                     stacked = steps[0][0].numel()
+                by = call.projected(steps)
                 for position, result in enumerate(results):
                     picked = replay if isinstance(call.result, Tensor) else _picked(replay, position)
-                    self._put([result], way, _Step(picked, sums, is_sum, projected, stacked=stacked))
+                    step = _Step(picked, sums, is_sum, projected, stacked=stacked, projected_by=by)
+                    self._put([result], way, step)
                 return
             factor = all(step.factor for _, step in steps) or _is_norm(call.name, steps, results)
             if not way.changed and any(step.replay is not None for _, step in steps) and not factor:
@@ -307,7 +333,7 @@ class OutputWays:
             way.changed = way.changed or f"{self._running()} computes {call.name} of"
             self._lose(way)
             return
-        of_added, added = replay, result
+        of_added, added, by = replay, result, None
         if len(steps) == 1 and call.name in _SUMS - _FUSED_SUMS and steps[0][0].shape == result.shape:
             # What is added is compared, for the stream may be many times as large.
             tensor, step = steps[0]
@@ -315,13 +341,13 @@ class OutputWays:
             added = call.first if call.first is not None and call.args[0] is tensor else tensor
             of_tensor = step.replay
             assert of_tensor is not None
-            of_added = of_tensor if factor == 1 else _scaled(of_tensor, factor)
+            of_added, by = (of_tensor, step.projected_by) if factor == 1 else (_scaled(of_tensor, factor), None)
             added = added if factor == 1 else factor * added
         assert way.take is not None
         taken, there = None, False
         with self._computing():
             try:
-                taken, there = way.take(of_added, added.detach())
+                taken, there = way.take(of_added, by, added.detach())
             except NotReplayed as error:
                 way.lost, way.mixes_rows, way.turned = str(error), error.mixes_rows, error.turned
             except (RuntimeError, TypeError, ValueError, IndexError) as error:
@@ -334,6 +360,10 @@ class OutputWays:
             computed = before is not None and not any(step.is_sum for _, step in steps)
             doubtful = computed and (not projected or (before is not None and before.projected))
             way.taken.append(_Taken(taken, result.shape, projected, sums, computed, doubtful))
+            if len(way.taken) == way.expected:
+                way.found, way.take = True, None
+                self._change(way, lambda step: None)
+                return
             self._put([result], way, _Step(replay, (*sums, len(way.taken)), is_sum=True))
 
     def _left(self, way: OutputWay, sums: tuple[int, ...], result: Tensor) -> bool:
@@ -425,7 +455,7 @@ class _Call:
         if self.name in _COPIES:
             return step.replay
         first = (self.first, *self.args[1:]) if self.in_place and id(self.args[0]) not in linear else self.args
-        given, form = pytree.tree_flatten((first, dict(self.kwargs)))
+        given, rebuilt = _flat(first, self.kwargs)
         given = [_Followed(linear[id(value)]) if id(value) in linear else value for value in given]
         function, in_place = _RESHAPES.get(self.name, self.function), self.in_place
         if in_place and hasattr(Tensor, self.name):  # of many outputs at once, nothing can be written into one tensor
@@ -435,11 +465,39 @@ class _Call:
             values = [_filled(value, output) for value in given]
             if in_place:
                 values[0] = values[0].clone()
-            args, kwargs = pytree.tree_unflatten(values, form)
+            args, kwargs = rebuilt(values)
             result: Tensor = function(*args, **kwargs)
             return result
 
         return replay
+
+    def projected(self, steps: _Steps) -> Projected | None:
+        """Return what the result is of the one tensor that is followed, as one linear layer; None: something else."""
+        (tensor, step), *others = steps
+        by = step.projected_by
+        if by is None or others or not isinstance(self.result, Tensor) or step.sums:
+            return None
+        same = self.result.shape == tensor.shape
+        if (self.name in _COPIES | {"getitem"} and same) or (self.name in _ARRANGES and by.gate is None):
+            return by
+        if self.name == "linear" and by.weight is None and self.args[0] is tensor and len(self.args) > 1:
+            bias = self.args[2] if len(self.args) > 2 else self.kwargs.get("bias")
+            return Projected(self.args[1].detach(), None if bias is None else bias.detach())
+        operands = list(tensors_among(self.args))
+        if self.name == "mul" and by.weight is not None and by.gate is None and len(operands) == 2 and same:
+            return Projected(by.weight, by.bias, operands[operands[0] is tensor].detach())
+        return None
+
+
+def _flat(
+    args: tuple[Any, ...], kwargs: Mapping[str, Any]
+) -> tuple[list[Any], Callable[[list[Any]], tuple[Sequence[Any], Mapping[str, Any]]]]:
+    """Return the arguments of a function as a list, and a function that makes both of such a list again."""
+    given, names, count = [*args, *kwargs.values()], tuple(kwargs), len(args)
+    if not any(isinstance(value, list | tuple | dict) for value in given):
+        return given, lambda values: (values[:count], dict(zip(names, values[count:], strict=True)))
+    given, form = pytree.tree_flatten((args, dict(kwargs)))
+    return given, lambda values: pytree.tree_unflatten(values, form)
 
 
 def _sums(steps: _Steps) -> tuple[int, ...]:

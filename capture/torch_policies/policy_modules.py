@@ -5,13 +5,14 @@ from __future__ import annotations
 import types
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import nn
 
 from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
+from vla_attention.capture.torch_policies.watched_places import WatchedPlaces
 from vla_attention.schemas.errors import BadArgument
 
 #: How deep modules are looked for in objects that are no modules.
@@ -40,10 +41,12 @@ class FoundPolicy:
     Attributes:
         policy: what was given.
         modules: by path, see `modules_of`.
+        places: where it computes attention, which its calls show.
     """
 
     policy: object
     modules: Mapping[str, nn.Module]
+    places: WatchedPlaces = field(default_factory=WatchedPlaces)
 
 
 def find_policy(policy: object) -> FoundPolicy:

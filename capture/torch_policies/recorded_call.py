@@ -168,7 +168,13 @@ class WatchedCall(ReplanRecorder):
             key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.valid)
             stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
         if not all_finite(actions, stored):
-            raise not_finite(one.where, "Its rows are finite, its actions or contributions are not", self.remedy)
+            wrong = [name for name, rows in stored.items() if not np.isfinite(rows.row_sum).all()]
+            found = (
+                f"Rows of site '{wrong[0]}' are not"
+                if wrong
+                else "Its rows are finite, its actions or contributions are not"
+            )
+            raise not_finite(one.where, found, self.remedy)
         data = inputs.dataset_actions
         if data is not None and actions is not None:
             data = data[: len(actions)]  # beyond the policy's chunk there is nothing to compare

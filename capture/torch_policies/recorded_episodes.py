@@ -58,7 +58,7 @@ class Episode:
 
     success: True, False, or None where it is not known. num_steps: number of executed actions; None: not known (0 in
     the store). num_replans, num_dropped: recorded replan blocks, and blocks in which no
-    attention ran (the policy answered from a queue).
+    attention ran (the policy answered from a queue). num_whole: recorded ones that were watched throughout.
     """
 
     run: RecordedRun
@@ -68,6 +68,7 @@ class Episode:
     num_steps: int | None = None
     num_dropped: int = 0
     largest_error: float = 0.0
+    num_whole: int = 0
     unmet: Mapping[int, tuple[CallShape, str]] = field(default_factory=dict, repr=False)
     folder: Path | None = None
     _batch: EpisodeBatch | None = field(default=None, repr=False)
@@ -159,6 +160,8 @@ class Episode:
             **writer.start.provenance,
             "largest P·V error": f"{self.largest_error:.3g}",
             "replan blocks without attention": str(self.num_dropped),
+            "watched throughout": f"{self.num_whole} of {self.num_replans} replan blocks, with P·V of every call; the "
+            "others where attention ran before, with P·V of one block of each site",
         }
         writer.start = replace(writer.start, provenance=facts)
         self.run._check_weights()

@@ -35,6 +35,7 @@ from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, blo
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.capture.torch_policies.watched_places import WatchedPlaces
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, Note, UserError
 from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording
@@ -141,7 +142,8 @@ class RepeatedPolicy:
             no_pictures="",
         )
         self.call: CallToRepeat
-        self._found = found
+        #: Repeated calls may compute attention where recorded ones do not.
+        self._found = replace(found, places=WatchedPlaces())
         self._known = known
         self._identity = identity
         self._recording = recording

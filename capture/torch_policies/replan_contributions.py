@@ -7,7 +7,7 @@ the output took, and the parts have to add up to what was added.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from vla_attention.capture.recording.contributions import keys_of_parts, part_values
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallPlace
-from vla_attention.capture.torch_policies.output_ways import NotReplayed, OutputWay, Replay
+from vla_attention.capture.torch_policies.output_ways import NotReplayed, OutputWay, Projected, Replay
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.schemas.segments import segment_members, segments_of
 
@@ -40,6 +40,10 @@ class ReplanContributions:
         self._rows, self._early_roles = rows, early_roles
         #: By site and row of the batch: roles (key,), for which contributions are made, and members (key, part).
         self._parts: dict[tuple[str, int], tuple[NDArray[np.uint8], NDArray[np.bool_]]] = {}
+        #: By the same, and the site's keys that a call has: the keys of each part.
+        self._keys: dict[tuple[str, int, bytes], list[slice | Tensor]] = {}
+        #: By site and block: the number of the sum that is the stream, where it is known from other calls.
+        self.expected: Mapping[tuple[str, int], int] = {}
         self._ways: defaultdict[tuple[str, Cell], list[OutputWay]] = defaultdict(list)
         self._places: list[tuple[CallPlace, OutputWay]] = []
 
@@ -71,14 +75,53 @@ class ReplanContributions:
                     members = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
                     self._parts[site.name, row] = roles, members
                 members = self._parts[site.name, row][1]
-                parts = keys_of_parts(members if place.keys is None else members[place.keys], rows.device)
-            values = part_values(rows[row], call.value[row], parts)
-            values = values.view(*values.shape[:2], rows.shape[1], -1)
-            mixed.append(values.permute(1, 2, 0, 3))  # (part, head, query, dim)
-        way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, way.dtypes))
+                given = site.name, row, b"" if place.keys is None else place.keys.tobytes()
+                if given not in self._keys:
+                    members = members if place.keys is None else members[place.keys]
+                    self._keys[given] = keys_of_parts(members, rows.device)
+                parts = self._keys[given]
+            mixed.append(part_values(rows[row], call.value[row], parts))
+
+        def take(replay: Replay, by: Projected | None, added: Tensor) -> tuple[list[Tensor], bool]:
+            found = self._projected(call, mixed, place.queries, by, added, way.dtypes)
+            return found or self._added(call, mixed, place.queries, replay, added, way.dtypes)
+
+        way = OutputWay(take, self.expected.get((site.name, place.block)))
         self._ways[site.name, cell].append(way)
         self._places.append((place, way))
         return way
+
+    def _projected(
+        self, call: AttentionCall, mixed: Sequence[Tensor], queries: slice, by: Projected | None, added: Tensor,
+        dtypes: Iterable[torch.dtype],
+    ) -> tuple[list[Tensor], bool] | None:  # fmt: skip
+        """Return what `_added` does, by one product for all parts; None where that does not give what was added.
+
+        mixed: of each row, (query, part, head · dim).
+        """
+        shape = call.shape
+        if by is None or by.weight is None or call.heads_may_be_queries:
+            return None
+        size = shape.batch, shape.queries, by.weight.shape[0]
+        if added.shape != size or by.weight.shape[1] != mixed[0].shape[-1]:
+            return None
+        allowed, grams, there = _allowed(call, dtypes), [], False
+        gate = None if by.gate is None else by.gate.float().expand(size)
+        for row, parts in zip(self._rows, mixed, strict=True):
+            each = torch.nn.functional.linear(parts.transpose(0, 1), by.weight.float())  # (part, query, width)
+            constant = None if by.bias is None else by.bias.float()
+            if gate is not None:
+                each.mul_(of_row := gate[row, queries])
+                constant = None if constant is None else constant * of_row
+            total, theirs = each.sum(dim=0), added[row, queries].float()
+            given = total if constant is None else total + constant
+            mismatch, scale = float((given - theirs).abs().amax()), float(theirs.abs().amax())
+            if not mismatch <= allowed * scale:
+                return None
+            there = there or bool(total.any()) or not bool(parts.any())
+            vectors = torch.cat([each, total[None]]).flatten(1)
+            grams.append(vectors @ vectors.T / len(total))
+        return grams, there
 
     def _added(
         self, call: AttentionCall, mixed: Sequence[Tensor], queries: slice, replay: Replay, added: Tensor,
@@ -86,11 +129,14 @@ class ReplanContributions:
     ) -> tuple[list[Tensor], bool]:  # fmt: skip
         """Return the Gram matrix of each recorded row, and whether the action queries are in what was added.
 
-        mixed: of each row, (part, head, query, dim). added: what the policy added.
+        mixed: of each row, (query, part, head · dim). added: what the policy added.
         """
+        shape = call.shape
+        # (part, head, query, dim)
+        mixed = [parts.view(*parts.shape[:2], shape.heads, -1).permute(1, 2, 0, 3) for parts in mixed]
         if call.heads_may_be_queries:
             self._check_axes(call, mixed[0].sum(dim=0), queries, replay)
-        shape, most = call.shape, max(len(parts) for parts in mixed)
+        most = max(len(parts) for parts in mixed)
         # The last one is nothing: what is added whatever the attention gives. The last but one tells rows apart.
         given = mixed[0].new_zeros(most + 2, shape.batch, shape.heads, shape.queries, mixed[0].shape[-1])
         for number, (row, parts) in enumerate(zip(self._rows, mixed, strict=True), start=1):
@@ -106,8 +152,7 @@ class ReplanContributions:
         theirs = added.float().flatten(0, -2)[places]
         scale = theirs.abs().amax() if theirs.numel() else theirs.new_ones(())
         mismatch = float((total + given[-1, places] - theirs).abs().amax() / scale) if theirs.numel() else 0.0
-        names = [call.precision, *(str(dtype).removeprefix("torch.") for dtype in dtypes)]
-        allowed = max(TOLERANCE.get(name, 0.0) for name in names)
+        allowed = _allowed(call, dtypes)
         if not mismatch <= allowed:
             raise NotReplayed(
                 f"the parts of the keys add up to something that differs from what was added by {mismatch:.2g} of its "
@@ -158,3 +203,18 @@ class ReplanContributions:
             if way.result() is None:
                 return f"in block {place.block} of site '{place.site}' (step {place.step}), {way.lost}"
         return None
+
+    def sums(self) -> dict[tuple[str, int], int | None]:
+        """Return by site and block which sum was the stream; None where it was not the same in all calls."""
+        sums: dict[tuple[str, int], int | None] = {}
+        for place, way in self._places:
+            number = len(way.taken) if way.result() is not None and way.taken else None
+            key = place.site or "", place.block
+            sums[key] = number if sums.get(key, number) == number else None
+        return sums
+
+
+def _allowed(call: AttentionCall, dtypes: Iterable[torch.dtype]) -> float:
+    """The largest difference, relative to the largest number, of what is computed twice in a call and behind it."""
+    names = [call.precision, *(str(dtype).removeprefix("torch.") for dtype in dtypes)]
+    return max(TOLERANCE.get(name, 0.0) for name in names)

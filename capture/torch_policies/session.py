@@ -260,6 +260,7 @@ class RecordedRun:
         replan.recorded = True
         for one, of_sites in zip(rows, rows_of_sites, strict=True):
             one.episode.largest_error = max(one.episode.largest_error, call.largest_error)
+            one.episode.num_whole += call.whole
             one.episode._append(call.record(one, of_sites, replan.actions))
 
     def _check_contributions(self, call: WatchedCall) -> None:

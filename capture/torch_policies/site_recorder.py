@@ -10,6 +10,7 @@ from itertools import product
 
 import numpy as np
 import torch
+from msgspec import structs
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -92,6 +93,8 @@ class ReplanRecorder(CallOrder):
         #: By site: rows, and what uniform attention gives in their place, for one head where it is the same for all.
         self._rows: defaultdict[str, _OfCalls] = defaultdict(lambda: defaultdict(list))
         self._uniform: defaultdict[str, _OfCalls] = defaultdict(lambda: defaultdict(list))
+        #: By site: which keys the last call saw, and what uniform attention gives for them.
+        self._uniform_before: dict[str, tuple[Tensor, Tensor]] = {}
 
     def early_roles(self, row: int, site: RecordedSite) -> NDArray[np.uint8]:
         """Return the roles of keys before the masks are known, for contributions."""
@@ -171,9 +174,41 @@ class ReplanRecorder(CallOrder):
         queries, recording = place.queries, self.recordings[site.name]
         cell = place.block, 0 if self.layout.autoregressive else place.step
         rows = call.rows(queries)
-        error = call.product_error(rows, queries)
+        if self._is_checked(call.shape, place, site.name):
+            self._check(call, rows, place)
+        if self.layout.autoregressive and (problem := self._caches.problem(call, (site.name, place.block))):
+            self.problems[f"of a call of site '{site.name}', {problem}"] = None
+        rows = torch.threshold(rows, NO_MASS, 0.0)
+        way, by_part = None, recording.contributions
+        self.contributions.expected = {} if self.whole else self.known.sums
+        asks_of_axes = self.asks_of_axes and call.heads_may_be_queries
+        if by_part or self.asks_of_batch or asks_of_axes:
+            self.asks_of_batch, self.asks_of_axes = False, self.asks_of_axes and not asks_of_axes
+            way = self.contributions.way(call, rows, place, site, cell, by_part=by_part)
+        chosen = self._chosen(rows, place, site)
+        large = chosen.numel() > _LARGE_COPY
+        self._rows[site.name][cell].append(chosen.cpu() if large else chosen)
+        uniform = self._uniform_of(call.allowed(queries), place, site)
+        self._uniform[site.name][cell].append(uniform.cpu() if large else uniform)
+        return way
+
+    def _is_checked(self, shape: CallShape, place: CallPlace, site: str) -> bool:
+        """Whether the rows of a call are compared with what the kernel gave; see `WatchedPlaces`.
+
+        All are in a call that is watched throughout, and those that have another shape than before; else those of one
+        block, another one from call to call.
+        """
+        alike, blocks = structs.replace(shape, number=0), self.known.blocks[site]
+        if self.whole or alike not in self.known.compared:
+            self.known.compared.add(alike)
+            return True
+        return place.block == blocks[self.number % len(blocks)]
+
+    def _check(self, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
+        """Raise an error unless rows (batch, head, query, key) give what the policy's own kernel gave."""
+        error = call.product_error(rows, place.queries)
+        block = f"block {place.block} of site '{place.site}' (module '{call.shape.module}')"
         if not math.isfinite(error) and not bool(torch.isfinite(call.output).all() & torch.isfinite(rows).all()):
-            block = f"block {place.block} of site '{site.name}' (module '{call.shape.module}')"
             raise not_finite(self.where, f"They begin before or at denoise step {place.step}, {block}", self.remedy)
         self.largest_error = max(self.largest_error, error)
         if problem := call.unfit(rows, error):
@@ -181,27 +216,21 @@ class ReplanRecorder(CallOrder):
                 f"The rows of site '{place.site}', block {place.block}, step {place.step} (module "
                 f"'{call.shape.module}') {problem}."
             )
-        if self.layout.autoregressive and (problem := self._caches.problem(call, (site.name, place.block))):
-            self.problems[f"of a call of site '{site.name}', {problem}"] = None
-        rows, seen = torch.threshold(rows, NO_MASS, 0.0), call.allowed(queries)
-        uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
-        way, by_part = None, recording.contributions
-        asks_of_axes = self.asks_of_axes and call.heads_may_be_queries
-        if by_part or self.asks_of_batch or asks_of_axes:
-            self.asks_of_batch, self.asks_of_axes = False, self.asks_of_axes and not asks_of_axes
-            way = self.contributions.way(call, rows, place, site, cell, by_part=by_part)
-        if place.keys is not None:
-            keys, count = torch.from_numpy(place.keys).to(rows.device), site.keys.num_keys
-            parts = (rows, uniform)
-            rows, uniform = (part.new_zeros(*part.shape[:-1], count).index_copy_(-1, keys, part) for part in parts)
-        chosen = [self._chosen(values, recording) for values in (rows, uniform)]
-        large = chosen[0].numel() > _LARGE_COPY
-        for kept, values in zip((self._rows, self._uniform), chosen, strict=True):
-            kept[site.name][cell].append(values.cpu() if large else values)
-        return way
 
-    def _chosen(self, values: Tensor, recording: Recording) -> Tensor:
-        """What is recorded (row, head or 1, query, key) of values (batch, head or 1, query, key)."""
+    def _uniform_of(self, seen: Tensor, place: CallPlace, site: RecordedSite) -> Tensor:
+        """What uniform attention gives for keys that are seen (batch, head or 1, query, key), as it is recorded."""
+        before, uniform = self._uniform_before.get(site.name, (None, seen))
+        if before is not seen:  # most calls of a site have the same mask
+            uniform = self._chosen(seen / seen.sum(dim=-1, keepdim=True).clamp(min=1), place, site)
+            self._uniform_before[site.name] = seen, uniform
+        return uniform
+
+    def _chosen(self, values: Tensor, place: CallPlace, site: RecordedSite) -> Tensor:
+        """What is recorded (row, head or 1, query, key) of values (batch, head or 1, query, key of the call)."""
+        recording = self.recordings[site.name]
+        if place.keys is not None:
+            keys = torch.from_numpy(place.keys).to(values.device)
+            values = values.new_zeros(*values.shape[:-1], site.keys.num_keys).index_copy_(-1, keys, values)
         if len(self.rows) < self.batch:
             values = values.index_select(0, torch.tensor(self.rows, device=values.device))
         heads = values.shape[1]
@@ -219,6 +248,8 @@ class ReplanRecorder(CallOrder):
         """
         self.check(self.where)
         unknown = self.contributions.unknown() is not None
+        if self.whole:
+            self.known.learn_sums(self.contributions.sums())
         rows_of_sites: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():
             stacked, uniform = (self._stacked(kept[name], recording) for kept in (self._rows, self._uniform))
@@ -240,16 +271,20 @@ class ReplanRecorder(CallOrder):
         return rows_of_sites
 
     def _stacked(self, calls: _OfCalls, recording: Recording) -> NDArray[np.float32]:
-        """What calls gave, (layer, denoise, row of the batch, head, query, key), off the device in one transfer."""
-        heads = max(tensor.shape[1] for of_cell in calls.values() for tensor in of_cell)
-        cells = [
-            torch.cat([tensor.expand(-1, heads, -1, -1) for tensor in calls[cell]], dim=2)
-            for cell in product(recording.layers, recording.denoise_steps)
-        ]
+        """What calls gave, (layer, denoise, row of the batch, head, query, key), off the device in one transfer.
+
+        Where all gave the same tensor, layer and denoise have length 1.
+        """
+        each = [calls[cell] for cell in product(recording.layers, recording.denoise_steps)]
+        layers, steps = len(recording.layers), len(recording.denoise_steps)
+        if all(len(of_cell) == 1 and of_cell[0] is each[0][0] for of_cell in each):
+            each, layers, steps = each[:1], 1, 1
+        heads = max(tensor.shape[1] for of_cell in each for tensor in of_cell)
+        cells = [torch.cat([tensor.expand(-1, heads, -1, -1) for tensor in of_cell], dim=2) for of_cell in each]
         if self.layout.autoregressive and recording.queries == "mean":
             cells = [cell.mean(dim=2, keepdim=True) for cell in cells]
         stacked: NDArray[np.float32] = torch.stack(cells).cpu().numpy()
-        return stacked.reshape(len(recording.layers), len(recording.denoise_steps), *stacked.shape[1:])
+        return stacked.reshape(layers, steps, *stacked.shape[1:])
 
     @property
     def remedy(self) -> str:

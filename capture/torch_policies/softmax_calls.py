@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
+from msgspec import structs
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.attention_calls import NO_MASS, AttentionCall, CallShape, exact
@@ -23,7 +24,6 @@ from vla_attention.capture.torch_policies.call_tensors import (
     check_change,
     fitted_change,
     normalised,
-    visible,
 )
 from vla_attention.capture.torch_policies.output_ways import used_tensors
 from vla_attention.capture.torch_policies.products import PRODUCTS, Product, find_product, operands_of
@@ -70,8 +70,9 @@ class _Softmax:
     """A softmax whose result has not met values yet.
 
     logits: what it took; before: the same without the watcher's change. change: that one, (batch or 1, head or 1, query
-    or 1, key or 1). reordered: whether what is followed went through a function that changes the order of keys, heads
-    or rows. numbers: of this softmax among those of the block, and of others in it, as of a mean of two.
+    or 1, key or 1). kind: what tells it from other softmaxes behind its place. reordered: whether what is followed went
+    through a function that changes the order of keys, heads or rows. numbers: of this softmax among those of the block,
+    and of others in it, as of a mean of two.
     """
 
     numbers: tuple[int, ...]
@@ -79,6 +80,7 @@ class _Softmax:
     logits: Tensor
     before: Tensor
     change: Tensor | None
+    kind: tuple[Any, ...]
     reordered: bool = False
 
 
@@ -107,6 +109,8 @@ class Softmaxes:
         #: All that met none yet, by their numbers, and the last function of what is followed.
         self.unmet: dict[int, tuple[CallShape, str]] = {}
         self._count = 0
+        #: Those that met values.
+        self._met: set[int] = set()
         #: Module and number of keys -> the function that selected some of them.
         self._selected: dict[tuple[str, int], str] = {}
 
@@ -120,10 +124,19 @@ class Softmaxes:
         if not 3 <= logits.ndim <= 5 or axis not in (-1, logits.ndim - 1):
             return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
-        path, module = self._mode.where()
-        # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
-        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
-        shape = self._mode.new_shape(path, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
+
+        def find_out() -> tuple[CallShape, None]:
+            path, module = self._mode.where()
+            # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
+            batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
+            sizes = (batch, heads, heads, queries, keys)
+            return self._mode.new_shape(path, "softmax", sizes, logits.dtype), None
+
+        kind: tuple[Any, ...] = ("softmax", logits.shape, logits.dtype)
+        met = None if self._mode.changes else self._mode.known(("call", self._mode.place, *kind))
+        if met is not None and self._mode.passes(structs.replace(met, number=self._mode.number)):
+            return function(*args, **kwargs)  # nothing of it is wanted
+        shape, _ = self._mode.facts(kind, find_out)
         batch, heads = shape.batch, shape.heads
         self._count += 1
         change, given = self._mode.change(shape), logits
@@ -139,7 +152,8 @@ class Softmaxes:
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
             self.changed.add(self._count)
         self.unmet[self._count] = shape, "softmax"
-        self._followed.put(result, _Softmax((self._count,), shape, given.detach(), logits.detach(), change))
+        kind = self._mode.place, *kind
+        self._followed.put(result, _Softmax((self._count,), shape, given.detach(), logits.detach(), change, kind))
         return result
 
     def select(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
@@ -236,7 +250,7 @@ class Softmaxes:
         keys = count + sinks
         kv_heads = math.prod(multiplied.shape[: product.num_lead_of_values]) // sizes[0]
         before = softmax.shape
-        shape = replace(
+        shape = structs.replace(
             before, number=self._mode.number, batch=sizes[0], heads=sizes[1], kv_heads=kv_heads, queries=sizes[2],
             keys=keys,
         )  # fmt: skip
@@ -259,18 +273,22 @@ class Softmaxes:
                     "all heads and queries alike, or compute the softmax over (batch, head, query, key)."
                 )
             )
+        alone = len(softmax.numbers) == 1 and softmax.numbers[0] not in self._met
+        self._met.update(softmax.numbers)
+        self._mode.learn(("call", *softmax.kind), structs.replace(shape, number=0) if alone else None)
         if self._mode.passes(shape):
             return
         with exact():
-            rows, allowed, unknown = _decided(multiplied, softmax, given, product, (*sizes, count))
-            seen = rows.new_ones((), dtype=torch.bool).expand(sizes[0], 1, sizes[2], keys)
+            arrangement = "arrangement", *softmax.kind, letters
+            order = None if self._mode.changes else self._mode.known(arrangement)
+            rows, logits, order, unknown = _decided(multiplied, softmax, given, product, (*sizes, count), order)
+            self._mode.learn(arrangement, order)
             values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, count, dim)
             if sinks:
                 left = normalised(_wide(softmax.logits))[..., count:].permute(product.rows)
                 rows = torch.cat([rows, left.reshape(*sizes, sinks)], dim=-1)
                 values = nn.functional.pad(values, (0, 0, 0, sinks))
-                allowed = None if allowed is None else nn.functional.pad(allowed, (0, sinks), value=True)
-            seen = seen if allowed is None else allowed
+            seen = self._mode.masks.seen_by(rows, logits, sinks, alike=not self._mode.whole)
         back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
         self._products.put(result, _Made(shape, product.output.index(len(product.rows) - 2)))
         self._mode.saw(
@@ -279,10 +297,10 @@ class Softmaxes:
                 values,
                 result.detach().permute(back).reshape(*sizes, dim),
                 lambda queries, batch: rows[batch, :, queries],
-                lambda queries: seen[:, :, queries],
+                lambda queries: seen if queries.indices(sizes[2]) == (0, sizes[2], 1) else seen[:, :, queries],
                 lambda mixed: mixed.reshape(*multiplied.shape[:-1], dim).permute(product.output),
                 given.dtype,
-                None if shape == replace(before, number=shape.number, kv_heads=kv_heads) else before,
+                None if shape == structs.replace(before, number=shape.number, kv_heads=kv_heads) else before,
                 refused or unknown,
             ),
             [
@@ -340,33 +358,37 @@ def _is_changed(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product
         return alike and not bool(rows.reshape(cut.shape).masked_select(cut).any())
 
 
-def _arranged(
-    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product
-) -> tuple[Callable[[Tensor], Tensor], Tensor] | None:
-    """Return how the softmax's axes became those of a product, and its probabilities so; None where it is not known."""
+def _arranged(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[int, Tensor] | None:
+    """Return which way the softmax's axes became those of a product, and its probabilities so; None if in none."""
     expected = normalised(_wide(softmax.logits))
-    for arrange in _arrangements(expected, given):
+    for number, arrange in enumerate(_arrangements(expected, given)):
         arranged = arrange(expected).permute(product.rows)
         if _are_equal(rows, arranged, _rounding(rows, softmax)):
-            return arrange, arranged
+            return number, arranged
     return None
 
 
 def _decided(
-    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product, sizes: tuple[int, ...]
-) -> tuple[Tensor, Tensor | None, str]:
-    """Return the rows of a product float32, the keys that the mask allows, and why it is refused.
+    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product, sizes: tuple[int, ...], order: int | None
+) -> tuple[Tensor, Tensor, int | None, str]:
+    """Return the rows of a product float32, what shows its mask, the arrangement, and why it is refused.
+
+    The mask shows in the logits, or is (batch, head, query, key) bool, of keys that are seen.
 
     rows: the probabilities as they are multiplied, (*lead, query, key). sizes: batch, heads, queries and keys, in which
-    rows and allowed keys are returned. No mask is None.
+    rows and logits are returned. order: the arrangement, if it is known, by its number; None where there is none.
     """
     narrow, rounding = torch.finfo(rows.dtype).bits < 32, _rounding(rows, softmax)
-    known = _arranged(rows, softmax, given, product)
-    if known is not None:
-        arrange, arranged = known
-        logits = arrange(softmax.before).permute(product.rows).reshape(sizes)
+    arranged: Tensor | None = None
+    if order is None and (found := _arranged(rows, softmax, given, product)) is not None:
+        order, arranged = found
+    if order is not None:
+        arrange = _arrangements(softmax.before, given)[order]
+        if narrow and arranged is None:
+            arranged = arrange(normalised(_wide(softmax.logits))).permute(product.rows)
         # Rounded to the compute precision, probabilities would not sum to 1.
-        return (arranged if narrow else rows.float()).reshape(sizes), visible(logits), ""
+        exact_rows = rows.float() if arranged is None or not narrow else arranged
+        return exact_rows.reshape(sizes), arrange(softmax.before).permute(product.rows).reshape(sizes), order, ""
     # Something else is multiplied than what the softmax gave, or its logits were written over: then a key that has any
     # mass is seen. In float16 nothing tells, for keys that are seen may have none.
     expected = normalised(_wide(softmax.logits))
@@ -380,7 +402,10 @@ def _decided(
         sums = rows.sum(dim=-1, keepdim=True)
         rows = rows / torch.where((sums - 1).abs() < _ROUNDING, sums, 1.0)
     rows = rows.reshape(sizes)
-    return rows, None if half else (rows > 0) & (rows > NO_MASS).any(dim=1, keepdim=True), refused
+    seen = torch.ones_like(rows, dtype=torch.bool)
+    if not half:
+        seen = (rows > 0) & (rows > NO_MASS).any(dim=1, keepdim=True)
+    return rows, seen, None, refused
 
 
 def _arrangements(expected: Tensor, given: Tensor) -> list[Callable[[Tensor], Tensor]]:

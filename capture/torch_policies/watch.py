@@ -3,6 +3,9 @@
 Compiled parts run eager meanwhile, and the fast path of `nn.MultiheadAttention`, which nothing sees, is off. The
 policy's own kernels compute what it returns: with nothing changed, actions are bit-equal with those of the same policy
 run eager with the fast path off.
+
+A mode makes every function of torch pass through Python. Once it is known where a policy computes attention
+(`WatchedPlaces`), the mode is on only there, and as long as something is followed that came of it.
 """
 
 from __future__ import annotations
@@ -10,17 +13,20 @@ from __future__ import annotations
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from threading import get_ident
+from typing import Any, TypeVar
 
 import torch
+from msgspec import structs
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher, exact
-from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused, Masks
 from vla_attention.capture.torch_policies.fused_calls import FLEX_FUNCTIONS, SDPA_FUNCTIONS, watch_flex, watch_sdpa
 from vla_attention.capture.torch_policies.output_ways import OutputWay, OutputWays
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
@@ -28,6 +34,12 @@ from vla_attention.capture.torch_policies.products import PRODUCTS
 from vla_attention.capture.torch_policies.softmax_calls import SELECTIONS, SOFTMAXES, Softmaxes
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
 from vla_attention.schemas.errors import BadArgument, UserError
+
+#: Runs a function of torch with its arguments, and notes what is known of its result.
+Handler = Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]
+
+_is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+_Fact = TypeVar("_Fact")
 
 _ACTIVE = threading.Lock()
 _OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
@@ -58,6 +70,7 @@ class AttentionMode(TorchFunctionMode):
 
     Attributes:
         outputs: the outputs of attention calls that are followed to the residual stream.
+        place: the one that came last; None for one outside of the policy. See `WatchedPlaces`.
     """
 
     def __init__(self, known: FoundPolicy, watcher: Watcher) -> None:
@@ -65,14 +78,15 @@ class AttentionMode(TorchFunctionMode):
         self._policy, self._watcher = known.policy, watcher
         self._paths = {id(module): path for path, module in known.modules.items()}
         self._softmaxes = Softmaxes(self)
+        self.masks = Masks()
         watcher.unmet = self._softmaxes.unmet
         self.outputs = OutputWays(lambda: f"module '{self.where()[0]}'", self.computing)
-        self._handlers: dict[Any, Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]] = {
-            **dict.fromkeys(SDPA_FUNCTIONS, lambda *call: watch_sdpa(self, *call)),
-            **dict.fromkeys(FLEX_FUNCTIONS, lambda *call: watch_flex(self, *call)),
-            **dict.fromkeys(SOFTMAXES, self._softmaxes.softmax),
+        self._handlers: dict[Any, Handler] = {
+            **dict.fromkeys(SDPA_FUNCTIONS, self._attending_here(partial(watch_sdpa, self))),
+            **dict.fromkeys(FLEX_FUNCTIONS, self._attending_here(partial(watch_flex, self))),
+            **dict.fromkeys(SOFTMAXES, self._attending_here(self._softmaxes.softmax)),
             **dict.fromkeys(PRODUCTS, self._softmaxes.follow),
-            **dict.fromkeys(SELECTIONS, self._softmaxes.select),
+            **dict.fromkeys(SELECTIONS, self._attending_here(self._softmaxes.select)),
         }
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self._error: BaseException | None = None
@@ -81,8 +95,17 @@ class AttentionMode(TorchFunctionMode):
         #: Heads of `nn.MultiheadAttention` while it runs, 0 otherwise.
         self._multihead_heads = 0
         self._way: OutputWay | None = None
-        self._thread = threading.get_ident()
+        self._thread = get_ident()
         self._ran_elsewhere = False
+        self._places = known.places
+        #: Whether the mode is on throughout, and after which places it is off otherwise.
+        self.whole = watcher.whole = known.places.next_is_whole()
+        watcher.number = known.places.calls
+        self._quiet: Set[int] = frozenset() if self.whole else known.places.quiet
+        #: The place that came last, all of the policy that came, and those with attention behind them.
+        self.place: int | None = 0
+        self._passed, self._attending = {0}, set[int | None]()
+        self._on = False
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -108,6 +131,13 @@ class AttentionMode(TorchFunctionMode):
             way, self._way = self._way, None
             self.outputs.begin(way, result[0] if isinstance(result, tuple) else result)
         return result
+
+    def _attending_here(self, handler: Handler) -> Handler:
+        def noting(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+            self._attending.add(self.place)
+            return handler(function, args, kwargs)
+
+        return noting
 
     def _multihead(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run the function of `nn.MultiheadAttention`, and see what it calls inside: projections and attention."""
@@ -183,8 +213,13 @@ class AttentionMode(TorchFunctionMode):
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is none of the watcher's, and count it then."""
-        with self._failing():
-            passed = self._watcher.passes(replace(shape, number=self.number))
+        if shape.number != self.number:
+            shape = structs.replace(shape, number=self.number)
+        try:
+            passed = self._watcher.passes(shape)
+        except BaseException as error:
+            self.failed(error)
+            raise
         self.number += passed
         return passed
 
@@ -214,18 +249,21 @@ class AttentionMode(TorchFunctionMode):
 
     def refuse_without_numbers(self, *tensors: Tensor) -> None:
         """Raise `UnseenAttention` for nested tensors, inside of vmap, and on the meta device."""
-        reason = ""
-        if any(torch._C._functorch.is_functorch_wrapped_tensor(tensor) for tensor in tensors):
+        for tensor in tensors:
+            if _is_wrapped(tensor) or tensor.is_nested or tensor.is_meta:
+                self._refuse_without_numbers(tensors)
+
+    def _refuse_without_numbers(self, tensors: Sequence[Tensor]) -> None:
+        if any(_is_wrapped(tensor) for tensor in tensors):
             reason = (
                 "inside of torch.vmap or another transform of torch.func, whose tensors have no numbers that can be "
                 "recorded. Call it with a batch instead."
             )
         elif any(tensor.is_nested for tensor in tensors):
             reason = "of nested tensors, whose rows cannot be recorded. Call the policy with padded tensors and a mask."
-        elif any(tensor.is_meta for tensor in tensors):
+        else:
             reason = "on the meta device, whose tensors have no numbers. Load the weights, and move the inputs to them."
-        if reason:
-            raise self.failed(UnseenAttention(f"{self.where()[0] or 'The policy'} computes attention {reason}"))
+        raise self.failed(UnseenAttention(f"{self.where()[0] or 'The policy'} computes attention {reason}"))
 
     def failed(self, error: BaseException) -> BaseException:
         """Remember an error of watching, and return it."""
@@ -240,12 +278,90 @@ class AttentionMode(TorchFunctionMode):
             self.failed(error)
             raise
 
-    def notice(self, module: nn.Module) -> None:
-        """Notice that a module runs: of the policy, or in a thread whose functions this mode does not see."""
-        if id(module) in self._paths:
-            self._watcher.modules.add(id(module))
-            if threading.get_ident() != self._thread:
-                self._ran_elsewhere = True
+    def pass_by(self, module: nn.Module, place: int) -> None:
+        """Notice that a module begins or ends, and be on or off from here to the next place; see `WatchedPlaces`.
+
+        Every module of the policy comes by here twice.
+        """
+        if get_ident() != self._thread:
+            self._ran_elsewhere = self._ran_elsewhere or id(module) in self._paths
+            return
+        self.place = place
+        if self.whole:
+            if id(module) in self._paths:
+                self._passed.add(place)
+            else:
+                self.place = None
+        elif (place in self._quiet) is self._on:
+            self._switch()
+
+    def _switch(self) -> None:
+        """Go on or off the stack of function modes, under what the policy may have put there meanwhile."""
+        above: Sequence[Any] = ()
+        base, height = self._base, torch._C._len_torch_function_stack()
+        if not self._on:
+            if height > base:
+                above = [torch._C._pop_torch_function_stack() for _ in range(height - base)]
+            torch._C._push_on_torch_function_stack(self)
+        else:
+            # torch takes it off while it is asked about a function, in which modules may run.
+            here = height > base and torch._C._get_function_stack_at(base) is self
+            if self._softmaxes.entries or self.outputs.entries or not here:
+                return
+            if height > base + 1:
+                above = [torch._C._pop_torch_function_stack() for _ in range(height - base - 1)]
+            torch._C._pop_torch_function_stack()
+        self._on = not self._on
+        for mode in reversed(above):
+            torch._C._push_on_torch_function_stack(mode)
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Be on in the block, throughout or where attention is."""
+        self._base = torch._C._len_torch_function_stack()
+        if 0 not in self._quiet:
+            self._switch()
+        _NOTICING.mode = self
+        try:
+            yield
+        finally:
+            _NOTICING.mode = None
+            self._softmaxes.entries.clear()
+            self.outputs.entries.clear()
+            if self._on:
+                self._switch()
+
+    @property
+    def changes(self) -> bool:
+        """Whether the watcher is asked for changes."""
+        return bool(self._watcher.changes)
+
+    def known(self, key: tuple[Any, ...]) -> Any:
+        """Return what was the same for all calls of one kind in blocks that were watched throughout; None in those.
+
+        key: what is known, the place, and what tells calls apart behind it.
+        """
+        return None if self.whole else self._places.facts.get((*key, self._multihead_heads))
+
+    def learn(self, key: tuple[Any, ...], facts: Any) -> None:
+        """Keep what is known of calls of one kind, key as in `known`; facts: None if it is not the same for all."""
+        if self.whole and key[1] is not None:
+            self._places.learn((*key, self._multihead_heads), facts)
+
+    def facts(self, kind: tuple[Any, ...], find_out: Callable[[], tuple[CallShape, _Fact]]) -> tuple[CallShape, _Fact]:
+        """Return the shape of the call that comes next, and something else that is the same for all such calls.
+
+        kind: what tells calls apart behind a place. find_out: is asked where this is not known: who computes attention
+        stands in Python's frames, which are slow to read.
+        """
+        key = ("shape", self.place, *kind)
+        known = self.known(key)
+        if known is None:
+            shape, fact = find_out()
+            self.learn(key, (structs.replace(shape, number=0), fact))
+            return shape, fact
+        shape, fact = known
+        return structs.replace(shape, number=self.number), fact
 
     def close(self) -> None:
         """End a block whose code raised nothing; errors: see `watch_attention`, also those that the policy caught."""
@@ -264,6 +380,8 @@ class AttentionMode(TorchFunctionMode):
                 "it. Open the block in the thread that calls the policy, around that one call, and let no other thread "
                 "call it meanwhile."
             )
+        self._places.passed(self._passed, self._attending)
+        self._watcher.modules = {place for place in self._passed | self._places.seen if place > 0}
 
 
 @contextmanager
@@ -290,12 +408,8 @@ def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
         )
     try:
         mode = AttentionMode(known_policy, watcher)
-        with seen_by_python(), noticing_modules(), mode:
-            _NOTICING.mode = mode
-            try:
-                yield
-            finally:
-                _NOTICING.mode = None
+        with seen_by_python(), noticing_modules(), mode.watching():
+            yield
         mode.close()
     finally:
         _ACTIVE.release()
@@ -326,9 +440,13 @@ def noticing_modules() -> Iterator[None]:
         plain = _NOTICING.plain = nn.Module.__call__
 
         def noticed(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
-            if _NOTICING.mode is not None:
-                _NOTICING.mode.notice(module)
-            return plain(module, *args, **kwargs)
+            mode = _NOTICING.mode
+            if mode is None:
+                return plain(module, *args, **kwargs)
+            mode.pass_by(module, id(module))
+            result = plain(module, *args, **kwargs)
+            mode.pass_by(module, -id(module))
+            return result
 
         nn.Module.__call__ = _NOTICING.noticed = noticed  # type: ignore[method-assign]
     _NOTICING.blocks += 1

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Watcher
+from vla_attention.capture.torch_policies.policy_modules import find_policy
+from vla_attention.capture.torch_policies.watch import watch_attention
 
 
 @dataclass
@@ -34,6 +36,17 @@ class Seen(Watcher):
         self.allowed.append(call.allowed())
         self.errors.append(call.product_error(rows))
         self.calls.append(call)
+
+
+def first_and_narrow(policy: object, call: Callable[[], Tensor]) -> list[tuple[Seen, Tensor]]:
+    """Watch a call four times; returns the first, which is watched throughout, and the last, which is not."""
+    found, made = find_policy(policy), []
+    for _ in range(4):
+        seen = Seen()
+        with watch_attention(found, seen):
+            made.append((seen, call()))
+    assert [seen.whole for seen, _ in made] == [True, True, True, False]
+    return [made[0], made[-1]]
 
 
 class Attention(nn.Module):

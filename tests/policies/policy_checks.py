@@ -45,8 +45,11 @@ class PolicyCase:
     instruction: str = INSTRUCTION
 
 
-def record(case: PolicyCase, path: Path, replans: int = 2, **settings: Any) -> Any:
-    """Record one episode and return the opened store; checks that actions are bit-equal and that the store is whole."""
+def record(case: PolicyCase, path: Path, replans: int = 5, **settings: Any) -> Any:
+    """Record one episode and return the opened store; checks that actions are bit-equal and that the store is whole.
+
+    The first three replans are watched throughout, and the others only where attention ran: they have to give the same.
+    """
     with seen_by_python():
         expected = case.call(case.observation)
     settings = {"tokenizer": WordTokenizer(), "bits": 23, "durable": False, "queries": "all", "layers": None} | settings
@@ -68,6 +71,13 @@ def record(case: PolicyCase, path: Path, replans: int = 2, **settings: Any) -> A
     if "interventions" not in settings:
         assert run.largest_error < PRODUCT_TOLERANCE
     assert store.attributes.recording.contributions == settings.get("contributions", True)
+    for site in store.attributes.sites:
+        rows = rows_of(store, site.name)
+        np.testing.assert_array_equal(rows, np.broadcast_to(rows[:1], rows.shape))
+        if store.attributes.recording.contributions:
+            grams = store.episodes[0].read(f"{site.name}/contribution")
+            most = np.abs(grams[:1]).max(axis=(-1, -2), keepdims=True).clip(1e-9)
+            np.testing.assert_allclose(grams / most, np.broadcast_to(grams[:1] / most, grams.shape), atol=1e-5, rtol=0)
     return store
 
 

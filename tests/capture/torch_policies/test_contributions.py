@@ -33,14 +33,14 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
 
-def fill(run, policy, number=0, replans=2):
+def fill(run, policy, number=0, replans=5):
     with run.episode(task_id=0, episode_index=number, instruction="") as episode:
         for step in range(replans):
             with episode.replan(env_step=step) as replan:
                 replan.actions = policy.act()[0]
 
 
-def recorded(path, policy, replans=2, **settings):
+def recorded(path, policy, replans=5, **settings):
     """The store of one episode; nothing is said."""
     settings = {"layout": residual_layout(), "denoise_steps": "all", "durable": False} | settings
     with warnings.catch_warnings():
@@ -84,7 +84,7 @@ def test_parts_are_what_the_policy_adds_of_them(tmp_path, way):
     actions = policy.act()
     store = recorded(tmp_path, policy)
     episode, wanted = store.episodes[0], expected(policy, way)
-    # Every function is looked at in the first policy call, and in the second only what follows the attention.
+    # The first three policy calls are watched throughout, the others where attention is.
     for gram in episode.read("joint/contribution"):
         close(gram, wanted, most=3e-2 if way is WAYS["projected in bfloat16"] else 1e-5)
     np.testing.assert_array_equal(episode.read("actions")[1], actions[0].double().numpy())
@@ -105,7 +105,7 @@ def test_rows_of_a_batch_have_gates_of_their_own(tmp_path, name):
         va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), denoise_steps="all", durable=False) as run,
         run.episodes(facts) as episodes,
     ):
-        for step in range(2):
+        for step in range(5):
             with episodes.replan(env_step=step, active=[True, False, True]):
                 policy.act(batch=3)
         episodes.pop(1)  # nothing was recorded of it
