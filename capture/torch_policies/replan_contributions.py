@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.contributions import keys_of_parts, part_values
+from vla_attention.capture.recording.contributions import Projection, gram_matrix, keys_of_parts, part_values
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.output_ways import NotReplayed, OutputWay, Projected, Replay
@@ -105,22 +105,20 @@ class ReplanContributions:
         size = shape.batch, shape.queries, by.weight.shape[0]
         if added.shape != size or by.weight.shape[1] != mixed[0].shape[-1]:
             return None
-        allowed, grams, there = _allowed(call, dtypes), [], False
+        project, allowed, grams, there = Projection(by.weight, None), _allowed(call, dtypes), [], False
+        constant = 0.0 if by.bias is None else by.bias.float()
         gate = None if by.gate is None else by.gate.float().expand(size)
         for row, parts in zip(self._rows, mixed, strict=True):
-            each = torch.nn.functional.linear(parts.transpose(0, 1), by.weight.float())  # (part, query, width)
-            constant = None if by.bias is None else by.bias.float()
-            if gate is not None:
-                each.mul_(of_row := gate[row, queries])
-                constant = None if constant is None else constant * of_row
-            total, theirs = each.sum(dim=0), added[row, queries].float()
-            given = total if constant is None else total + constant
-            mismatch, scale = float((given - theirs).abs().amax()), float(theirs.abs().amax())
-            if not mismatch <= allowed * scale:
+            of_row = 1.0 if gate is None else gate[row, queries]
+            each = project(parts)  # (query, part, width)
+            if not isinstance(of_row, float):
+                each.mul_(of_row[:, None])
+            total, theirs = each.sum(dim=1), added[row, queries].float()
+            mismatch = (total + constant * of_row - theirs).abs().amax()
+            if not float(mismatch) <= allowed * float(theirs.abs().amax()):
                 return None
             there = there or bool(total.any()) or not bool(parts.any())
-            vectors = torch.cat([each, total[None]]).flatten(1)
-            grams.append(vectors @ vectors.T / len(total))
+            grams.append(gram_matrix(each, total))
         return grams, there
 
     def _added(
