@@ -1,7 +1,7 @@
 """What recording adds to a policy call, and what the usual way of getting attention costs.
 
 Usage: OMP_NUM_THREADS=1 python benchmarks/capture_overhead.py [--size small mid] [--rounds 9] [--device cpu]
-       [--dtype float32] [--clock processor] [--save]
+       [--dtype float32] [--clock processor] [--general] [--save]
 
 The policies are pi0.5 with seeded random weights and the key axis of openpi's pi05_libero (3 cameras of 256 keys, 200
 text slots, 10 actions; ten denoise steps; 18 blocks, 8 heads). small: the policy `untrained`, an expert of width 96.
@@ -15,6 +15,9 @@ The usual way stands beside it: eager attention that returns whole matrices (eve
 denoise steps to every key, key heads repeated, softmax in float32), each moved with `.cpu().numpy()` as its layer is
 done.
 
+--general compares our recorder of these policies with that of `va.record`, which watches the same model as one that
+nobody knows. Both see one product with the values: ours is made by pieces of the keys else.
+
 --save writes the rows to benchmarks/rows/capture_overhead.json.
 """
 
@@ -22,9 +25,12 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -169,13 +175,45 @@ def calls_of(policy: Any, synchronise: Callable[[], None] = lambda: None) -> dic
     return {"plain": plain, **{kind: recorded(kind) for kind in KINDS}, USUAL: usual}
 
 
-def overhead_table(policy: Any, rounds: int, clock: Callable[[], float], note: str) -> Table:
-    """Measure all kinds in turn."""
+def general_calls(policy: Any, folder: Path, stack: ExitStack) -> dict[str, Callable[[], Any]]:
+    """Return `calls_of` without the usual way, and the same kinds made with `va.record`."""
+    import vla_attention as va
+    from vla_attention.capture.policies.pi import model
+
+    stack.enter_context(mock.patch.object(model, "pieces_of_keys", return_value=None))
+    calls, steps, given, (keys,) = calls_of(policy), count(), prepared_input(policy), policy.sites
+    del calls[USUAL]
+    roles: dict[Any, Any] = {"image": "image", "text": "instruction", "state": "state", "action": "action"}
+    site = va.RecordedSite(keys, (0, policy.num_action_queries), {span.name: roles[span.kind] for span in keys.spans})
+    expert = r"paligemma_with_expert\.gemma_expert\.model\.layers\.(?P<block>\d+)\.self_attn"
+    layout = va.PolicyLayout(
+        "pi", policy.family, (site,), (va.CallRule(expert, "joint"), va.CallRule(".*", None)),
+        policy.num_layers, policy.num_heads, policy.num_denoise_steps,
+    )  # fmt: skip
+
+    def recorded(episode: Any) -> Any:
+        with episode.replan(env_step=next(steps)):
+            return policy.act(given, 0)
+
+    for number, (kind, settings) in enumerate(KINDS.items()):
+        chosen = {"denoise_steps": list(settings["steps"]), "contributions": settings["contributions"]}
+        run = va.record(folder / f"{number}.zarr", policy.model, layout=layout, durable=False, **chosen)
+        episode = stack.enter_context(run).episode(task_id=0, episode_index=0, instruction="")
+        calls[f"va.record: {kind}"] = partial(recorded, stack.enter_context(episode))
+        for _ in range(3):  # watched throughout
+            calls[f"va.record: {kind}"]()
+    return calls
+
+
+def overhead_table(
+    policy: Any, rounds: int, clock: Callable[[], float], note: str, calls: dict[str, Callable[[], Any]] | None = None
+) -> Table:
+    """Measure all kinds in turn. calls: those of `calls_of` unless given."""
     import numpy as np
 
-    calls = calls_of(policy)
+    calls = calls or calls_of(policy)
     expected = calls["plain"]()
-    for kind in KINDS:
+    for kind in calls.keys() - {USUAL}:
         if not np.array_equal(calls[kind](), expected):
             raise RuntimeError(f"Recording changed the actions: {kind}")
     seconds = take_turns(calls, rounds, clock=clock)
@@ -197,6 +235,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--dtype", default="float32")
     parser.add_argument("--clock", choices=("wall", "processor"), default="processor")
+    parser.add_argument("--general", action="store_true", help="compare with the recorder of va.record")
     parser.add_argument("--save", action="store_true", help="write benchmarks/rows/capture_overhead.json")
     arguments = parser.parse_args()
     fix_threads(1)
@@ -205,7 +244,9 @@ def main() -> None:
     tables = {}
     for size in arguments.size:
         policy = make_policy(size, arguments.device, arguments.dtype)
-        tables[size] = overhead_table(policy, arguments.rounds, clock, f"Counted are {what}.")
+        with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+            calls = general_calls(policy, Path(folder), stack) if arguments.general else None
+            tables[size] = overhead_table(policy, arguments.rounds, clock, f"Counted are {what}.", calls)
         for row in tables[size].rows:
             ms, times = row["ms"], row["times"]
             print(
