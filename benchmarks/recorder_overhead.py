@@ -1,7 +1,7 @@
 """Seconds of a policy call as it is, watched, and recorded: what `va.record` costs.
 
 Usage: python benchmarks/recorder_overhead.py [--rounds 7] [--calls 1] [--blocks 6] [--width 1024] [--device cpu]
-       [--dtype float32] [--threads 1] [--clock processor]
+       [--dtype float32] [--threads 1] [--clock processor] [--replans 2000]
 
 The policy is made for this: ten denoise steps of an action expert over a prefix of 968 keys of pictures and words and
 over its own ten tokens, with the sizes of pi0's expert (width 1024, 8 heads of 256, one key head; 18 blocks in pi0) and
@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
+import resource
 import sys
 import tempfile
 import time
@@ -167,6 +168,29 @@ def measure(
         return measurement.take_turns(calls_of, rounds, repeats=calls, clock=clock)
 
 
+def print_memory(policy: nn.Module, layout: va.PolicyLayout, act: Callable[[], Tensor], replans: int) -> None:
+    """Print this process's memory in an episode of so many replans: the rows of all queries and denoise steps."""
+    page, shown = resource.getpagesize(), {1, 10, *range(0, replans + 1, max(1, replans // 8))}
+    frames = {f"camera_{i}": torch.zeros(3, 224, 224) for i in range(CAMERAS)}
+    settings: dict[str, Any] = {"denoise_steps": "all", "queries": "all", "durable": False}
+    print("| replans | memory, MB | store, MB |\n|---|---|---|")
+    with tempfile.TemporaryDirectory() as folder:
+        with (
+            va.record(Path(folder) / "a.zarr", policy, layout=layout, **settings) as run,
+            run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        ):
+            for number in range(1, replans + 1):
+                with episode.replan(env_step=number, frames=frames) as replan:
+                    replan.actions = act()[0]
+                if number in shown:
+                    pages = int(Path("/proc/self/statm").read_text().split()[1])
+                    size = sum(file.stat().st_size for file in Path(folder).rglob("*") if file.is_file())
+                    print(f"| {number:,} | {pages * page / 1e6:.0f} | {size / 1e6:,.0f} |", flush=True)
+        print(
+            f"| most, with the end of the episode | {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} | |"
+        )
+
+
 def milliseconds(seconds: list[float]) -> str:
     """The median of the rounds."""
     return f"{measurement.measured(seconds, factor=1000).median:.1f}"
@@ -188,6 +212,7 @@ def main() -> None:
     parser.add_argument("--dtype", default="float32")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--clock", choices=("wall", "processor"), default="wall")
+    parser.add_argument("--replans", type=int, help="print the memory in an episode of so many replans, and no times")
     arguments = parser.parse_args()
     clock = time.perf_counter if arguments.clock == "wall" else time.process_time
     if arguments.threads:
@@ -203,6 +228,9 @@ def main() -> None:
     mask = torch.ones(1, 1, HORIZON, PREFIX + HORIZON, dtype=torch.bool, device=arguments.device)
     mask[..., PREFIX - 50 : PREFIX] = False
     given = torch.randn(1, HORIZON, 32, **settings), caches, mask
+    if arguments.replans:
+        print_memory(policy, layout(arguments.blocks), lambda: policy.act(*given), arguments.replans)
+        return
     with tempfile.TemporaryDirectory() as folder:
         seconds = measure(
             policy,

@@ -125,28 +125,44 @@ def create_rows(
     )
 
 
-def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: Sequence[str]) -> zarr.Array[Any]:
-    """Write a complete array as one file: one chunk when it is small, else a shard of chunks along its first axis."""
-    length = values.shape[0]
-    chunk_length = max(
-        1, min(length, TARGET_CHUNK_BYTES // max(1, math.prod(values.shape[1:]) * values.dtype.itemsize))
-    )
-    rest = tuple(max(1, extent) for extent in values.shape[1:])
-    array = group.create_array(
+def entries_per_chunk(rest: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Return the most entries of the first axis in one chunk of an array that is no array of rows."""
+    return max(1, TARGET_CHUNK_BYTES // max(1, math.prod(rest) * dtype.itemsize))
+
+
+def create_whole(
+    group: zarr.Group, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], axes: tuple[str, ...]
+) -> zarr.Array[Any]:
+    """Create an array that is one file: one chunk when it is small, else a shard of chunks along its first axis."""
+    length = shape[0]
+    chunk_length = max(1, min(length, entries_per_chunk(shape[1:], dtype)))
+    rest = tuple(max(1, extent) for extent in shape[1:])
+    return group.create_array(
         name,
-        shape=values.shape,
-        dtype=values.dtype,
+        shape=shape,
+        dtype=dtype,
         chunks=(chunk_length, *rest),
         shards=(chunk_length * math.ceil(length / chunk_length), *rest) if chunk_length < length else None,
         compressors=(
-            BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=values.dtype.itemsize),
+            BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=dtype.itemsize),
             Crc32cCodec(),
         ),
-        fill_value=MISSING[values.dtype.kind],
+        fill_value=MISSING[dtype.kind],
         chunk_key_encoding=CHUNK_KEYS,
         dimension_names=list(axes),
         # A chunk in which every number is the fill value is data, too.
         config={"write_empty_chunks": True},
     )
+
+
+def encode_whole(chunk: NDArray[Any]) -> bytes:
+    """A chunk as `create_whole` says that it is encoded, without the checksum that follows it."""
+    encoded: bytes = Blosc(cname="zstd", clevel=3, shuffle=Blosc.SHUFFLE).encode(np.ascontiguousarray(chunk))
+    return encoded
+
+
+def write_whole(group: zarr.Group, name: str, values: NDArray[np.generic], axes: tuple[str, ...]) -> zarr.Array[Any]:
+    """Write a complete array, as `create_whole` says."""
+    array = create_whole(group, name, values.shape, values.dtype, axes)
     array[...] = values
     return array

@@ -14,7 +14,14 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
+from vla_attention.capture.store.growing_arrays import GrowingArray
+from vla_attention.capture.store.replan_records import (
+    CHUNK_AXES,
+    EpisodeStart,
+    RecordedSteps,
+    ReplanEffects,
+    ReplanRecord,
+)
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.capture.store.unpublished import UnpublishedFolder
@@ -95,7 +102,7 @@ class EpisodeTaken(StoreExists):
 
 
 class EpisodeWriter:
-    """Collects replans; has at most one block of rows in memory and writes whole shards only."""
+    """Writes the replans of an episode as they come: what is in memory does not grow with their number."""
 
     def __init__(
         self,
@@ -123,11 +130,15 @@ class EpisodeWriter:
         with self._as_its_holder():
             self.group = zarr.create_group(UnpublishedFolder(folder), zarr_format=3)
             self.sites = {
-                site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site))
-                for site in run.sites
+                site.name: SiteWriter(self.group, folder, site, run.recording.of_site(site)) for site in run.sites
             }
         self.prompts: dict[Prompt, int] = {}
+        #: Of the replans, without what is written.
         self.records: list[ReplanRecord] = []
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._growing: dict[str, GrowingArray] = {}
+        #: (1, step, action_dim) of each replan, as many steps as the data set has from there on.
+        self._dataset_actions: list[NDArray[np.float64]] = []
 
     def append(self, record: ReplanRecord) -> None:
         """Add the next replan, or none of it.
@@ -145,9 +156,32 @@ class EpisodeWriter:
         with self._as_its_holder():
             for name, site in self.sites.items():
                 site.append(record.rows[name], record.key_role[name])
+            for name, (values, axes) in record.arrays.items():
+                if name == "dataset_actions":
+                    self._dataset_actions.append(values)
+                    continue
+                if name not in self._growing:
+                    self._growing[name] = GrowingArray(self.group, self.folder, name, axes)
+                self._growing[name].append(values)
         self.prompts.setdefault(record.prompt, len(self.prompts))
-        # The site writers have the rows; the rest is small and is written at the end.
-        self.records.append(replace(record, rows={}))
+        self._shapes = self._shapes or _shapes_of_replan(record)
+        self.records.append(self._without_arrays(record))
+
+    def _without_arrays(self, record: ReplanRecord) -> ReplanRecord:
+        """The facts of a replan alone; conditions of effects are those of the replans before it."""
+        effects = record.effects
+        if effects is not None:
+            before = self._earlier_effects or effects
+            empty = np.zeros((0, 0, 0), dtype=np.float32)
+            effects = replace(effects, conditions=before.conditions, items=before.items, change=empty, cut={})
+        return replace(
+            record, rows={}, key_role={}, state=None, actions=None, frames={}, camera_frames={}, coverage={},
+            dataset_actions=None, base_actions=None, effects=effects,
+        )  # fmt: skip
+
+    @property
+    def _earlier_effects(self) -> ReplanEffects | None:
+        return next((one.effects for one in self.records if one.effects is not None), None)
 
     def _problems(self, record: ReplanRecord) -> Iterator[str]:
         """What forbids adding a replan. The first sentence counts: later ones may rest on what it says is broken."""
@@ -192,7 +226,8 @@ class EpisodeWriter:
         first = self.records[0] if self.records else record
         if record.shown != first.shown:
             yield f"its pictures show the parts {dict(record.shown)} of their frames, and before {dict(first.shown)}"
-        given, before = _shapes_of_replan(record), _shapes_of_replan(first)
+        given = _shapes_of_replan(record)
+        before = self._shapes or given
         for name in sorted(given.keys() | before.keys()):
             here, there = (f"of the shape {of[name]}" if name in of else "not given" for of in (given, before))
             if here != there:
@@ -204,7 +239,7 @@ class EpisodeWriter:
         wanted = planned is not None and len(self.records) % planned.every == 0
         if wanted is not (effects is not None):
             yield f"it has {'no ' if wanted else ''}effects, other than the run says"
-        earlier = next((one.effects for one in self.records if one.effects is not None), effects)
+        earlier = self._earlier_effects
         if effects and earlier and (effects.conditions, effects.units) != (earlier.conditions, earlier.units):
             yield "its effects are of other conditions, or in other units, than those of the replans before it"
 
@@ -225,7 +260,12 @@ class EpisodeWriter:
             self._check_lock()
             for site in self.sites.values():
                 self.digests |= site.finish()
-            for name, (values, axes) in (self._side_arrays() | ({} if steps is None else steps.arrays)).items():
+            self.digests |= {name: array.finish() for name, array in self._growing.items()}
+            if self._dataset_actions:
+                longest = max(values.shape[1] for values in self._dataset_actions)
+                filled = [np.pad(of, ((0, 0), (0, longest - of.shape[1]), (0, 0))) for of in self._dataset_actions]
+                self.write("dataset_actions", np.concatenate(filled), CHUNK_AXES)
+            for name, (values, axes) in ({} if steps is None else steps.arrays).items():
                 self.write(name, values, axes)
             self.group.update_attributes(to_json(self._attributes(success, num_steps, steps)))
             run = read_run(self.store)[1]
@@ -256,7 +296,7 @@ class EpisodeWriter:
             env_step=tuple(int(record.env_step) for record in records),
             prompt_index=tuple(self.prompts[record.prompt] for record in records),
             noise_seed=tuple(int(record.noise_seed) for record in records if record.noise_seed is not None),
-            dataset_action_count=tuple(len(r.dataset_actions) for r in records if r.dataset_actions is not None),
+            dataset_action_count=tuple(values.shape[1] for values in self._dataset_actions),
             denoise_time=tuple(float(time) for time in self.denoise_times),
             effects=None
             if not measured
@@ -307,19 +347,6 @@ class EpisodeWriter:
         digest = ArrayDigest()
         digest.update(values)
         self.digests[name] = ArrayRecord(values.shape, digest.hexdigest())
-
-    def _side_arrays(self) -> dict[str, tuple[NDArray[Any], tuple[str, ...]]]:
-        """`ReplanRecord.arrays` of all replans together."""
-        collected: dict[str, tuple[list[NDArray[Any]], tuple[str, ...]]] = {}
-        for record in self.records:
-            for name, (values, axes) in record.arrays.items():
-                collected.setdefault(name, ([], axes))[0].append(values)
-        if "dataset_actions" in collected:
-            actions, axes = collected["dataset_actions"]
-            longest = max(values.shape[1] for values in actions)
-            filled = [np.pad(values, ((0, 0), (0, longest - values.shape[1]), (0, 0))) for values in actions]
-            collected["dataset_actions"] = (filled, axes)
-        return {name: (np.concatenate(values), axes) for name, (values, axes) in collected.items()}
 
     def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-attention store verify`."""

@@ -16,6 +16,9 @@ from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.layout import Part, Prompt
 from vla_attention.schemas.plumbing import Plumbing
 
+#: The axes of chunks of actions.
+CHUNK_AXES = ("replan", "horizon", "action_dim")
+
 
 @dataclass(frozen=True)
 class RecordedRows:
@@ -102,7 +105,7 @@ class ReplanRecord:
 
         Those of effects have an entry for each condition that was measured.
         """
-        chunk, pixels = ("replan", "horizon", "action_dim"), ("replan", "row", "column", "channel")
+        chunk, pixels = CHUNK_AXES, ("replan", "row", "column", "channel")
         given: list[tuple[str, NDArray[Any] | None, tuple[str, ...]]] = [
             ("state", self.state, ("replan", "state_dim")),
             ("actions", self.actions, chunk),

@@ -8,6 +8,7 @@ Here the chunks of each block go to the end of the file, and the shard's index a
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -19,14 +20,14 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import RowCodec, create_rows, keys_per_chunk, replans_per_block
+from vla_attention.capture.store.growing_arrays import GrowingArray, KeptArrays, ShardFile, SpilledArrays
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.groupings.key_counts import stored_uniform_of_roles, uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, to_stored
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
-from vla_attention.schemas.stores.array_metadata import chunk_file
-from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, ArrayDigest, crc32c
+from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.store_format import (
     ATOM_AXES,
     CONTRIBUTION_AXES,
@@ -35,9 +36,18 @@ from vla_attention.schemas.stores.store_format import (
     Recording,
 )
 
+#: Numbers of more bytes wait on the disk for the rest of their chunks.
+_MOST_WAITING = 64 << 20
+#: The same of what a replan has beside its rows: until the end of the episode, when its segments are known.
+_MOST_BESIDE = 32 << 10
+
+
+def _waiting(folder: Path, dtype: str, spilled: bool) -> KeptArrays | SpilledArrays:
+    return SpilledArrays(folder, dtype) if spilled else KeptArrays()
+
 
 class ShardWriter:
-    """An array (replan, layer, denoise, ..., key), whose file grows by blocks of replans; one block is in memory."""
+    """An array (replan, layer, denoise, ..., key), whose file grows by blocks of replans."""
 
     def __init__(
         self, group: zarr.Group, folder: Path, name: str, cells: tuple[int, ...], bits: int, keys: int | None = None
@@ -54,13 +64,11 @@ class ShardWriter:
         self.codec = RowCodec.of_bits(bits)
         self.keys = keys or cells[-1]
         self.block = self._replans_per_block()
-        self.file = folder / name / chunk_file(1 + len(cells))
-        self.file.parent.mkdir()
+        self.file = ShardFile(folder, name, 1 + len(cells))
         self.num_replans = 0
         self.digest = ArrayDigest()
-        self._pending: list[NDArray[Any]] = []
-        self._index: list[tuple[int, int]] = []
-        self._size = 0
+        spilled = self.block * math.prod(cells) * self.codec.itemsize > _MOST_WAITING
+        self._waiting = _waiting(folder, self.codec.dtype, spilled)
 
     def _replans_per_block(self, count: int | None = None) -> int:
         rest = math.prod(self.cells[2:-1])
@@ -68,141 +76,153 @@ class ShardWriter:
 
     def append(self, values: NDArray[np.float32]) -> None:
         """Add the probabilities of the next replan, (layer, denoise, ..., key)."""
-        self._pending.append(to_stored(values, self.bits))
-        if len(self._pending) == self.block:
+        stored = to_stored(values, self.bits)
+        self.digest.update(stored)
+        self._waiting.append(stored)
+        if len(self._waiting) == self.block:
             self._flush()
 
     def _flush(self) -> None:
-        values = np.stack(self._pending)
-        self._pending.clear()
+        count, num_keys = len(self._waiting), self.cells[-1]
         if not self.num_replans:
-            self.block = self._replans_per_block(len(values))
-        num_keys = self.cells[-1]
+            self.block = self._replans_per_block(count)
         # What a chunk has beyond the last replan or key is never read. Beyond the last replan it is the fill value, as
         # zarr-python would write it; in every row zeros take less room.
         chunk = np.full((self.block, *self.cells[2:-1], self.keys), np.nan, dtype=self.codec.dtype)
-        with self.file.open("ab") as file:
-            for layer, denoise, first in product(*map(range, self.cells[:2]), range(0, num_keys, self.keys)):
-                part = values[:, layer, denoise, ..., first : first + self.keys]
-                chunk[: len(values), ..., : part.shape[-1]] = part
-                chunk[: len(values), ..., part.shape[-1] :] = 0
-                encoded = _with_checksum(self.codec.encode(chunk))
-                file.write(encoded)
-                self._index.append((self._size, len(encoded)))
-                self._size += len(encoded)
-        self.num_replans += len(values)
-        self.digest.update(values)
+        for cell in product(*map(range, self.cells[:2])):
+            values = np.stack([self._waiting.part(replan, *cell) for replan in range(count)])
+            for first in range(0, num_keys, self.keys):
+                part = values[..., first : first + self.keys]
+                chunk[:count, ..., : part.shape[-1]] = part
+                chunk[:count, ..., part.shape[-1] :] = 0
+                self.file.append(self.codec.encode(chunk))
+        self.num_replans += count
+        self._waiting.clear()
 
     def finish(self, axes: Sequence[str]) -> ArrayRecord:
         """Write the index (offset and length of every chunk, in the order of the chunk grid) and the metadata."""
-        if self._pending:
+        if self._waiting:
             self._flush()
-        index = np.array(self._index, dtype="<u8").tobytes()
-        with self.file.open("ab") as file:
-            file.write(_with_checksum(index))
+        self._waiting.close()
+        self.file.finish()
         shape = (self.num_replans, *self.cells)
         create_rows(self.group, self.name, shape, (self.block, self.keys), axes, self.codec)
         return ArrayRecord(shape, self.digest.hexdigest())
 
 
-def _with_checksum(content: bytes) -> bytes:
-    return content + crc32c(content).to_bytes(CHECKSUM_BYTES, "little")
-
-
-#: Writes one complete array of the episode: name, values, axes.
-WriteArray = Callable[[str, NDArray[np.generic], tuple[str, ...]], None]
-
-
 class SiteWriter:
-    """Collects one site's replans; has at most one block of rows in memory."""
+    """Collects one site's replans, with one replan and the chunks that are not full in memory."""
 
-    def __init__(
-        self, group: zarr.Group, folder: Path, write: WriteArray, layout: SiteLayout, recording: Recording
-    ) -> None:
+    def __init__(self, group: zarr.Group, folder: Path, layout: SiteLayout, recording: Recording) -> None:
         """Begin the site's group in the episode's `group`, whose folder it is; `recording` is what is of the site."""
         self.group = group
         self.folder = folder
-        self.write = write
         self.layout = layout
         self.recording = recording
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
-        self.masses: list[tuple[tuple[Segment, ...], NDArray[np.float32]]] = []
-        self.others: list[dict[str, NDArray[Any]]] = []
         self.segments: tuple[Segment, ...] = ()
+        #: Of each replan its own segments, and what uniform attention gives, by its number among the different ones.
+        self._segments: list[tuple[Segment, ...]] = []
+        self._uniform: list[int] = []
+        self._uniforms: dict[bytes, tuple[int, NDArray[np.float32]]] = {}
+        self._roles: list[NDArray[np.uint8]] = []
+        #: Of each replan the masses of its segments, with the sums of rows behind them, and its contributions.
+        self._beside = _waiting(folder, "<f4", 8 * 4 * math.prod(self.shape) > _MOST_BESIDE)
         group.create_group(layout.name, attributes=to_json(recording.axis_numbers))
         cells, keys = (*self.shape, layout.num_keys), keys_per_chunk(layout)
         self.rows = ShardWriter(group, folder, f"{layout.name}/rows", cells, recording.mantissa_bits, keys)
 
     def arrays(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """Path in the episode -> values of one replan, with an axis of length 1 for it; `append` adds them."""
-        uniform = recorded.uniform
-        if uniform is None:
-            uniform = uniform_of_roles(key_role).astype(np.float32)[None, None, None, None]
         arrays: dict[str, NDArray[Any] | None] = {
             "key_role": key_role,
             "row_sum": recorded.row_sum,
-            "uniform": uniform,
+            "uniform": self._given_uniform(recorded, key_role),
             "rows": recorded.rows,
             "contribution": recorded.contribution,
         }
         return {f"{self.layout.name}/{kind}": values[None] for kind, values in arrays.items() if values is not None}
+
+    @staticmethod
+    def _given_uniform(recorded: RecordedRows, key_role: NDArray[np.uint8]) -> NDArray[np.float32]:
+        if recorded.uniform is not None:
+            return recorded.uniform
+        return uniform_of_roles(key_role).astype(np.float32)[None, None, None, None]
 
     def append(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> None:
         """Add the next replan, whose `arrays` break no rule. Rows as in `RecordedRows`; roles (key,)."""
         segments = segments_of(self.layout, key_role)
         members = segment_members(self.layout, key_role[None], segments)[0]
         # Atoms and sums come from the rows as computed, so that the rounded rows can be compared with them.
-        self.masses.append((segments, segment_masses(recorded.rows, members)))
+        masses = np.asarray(segment_masses(recorded.rows, members), dtype=np.float32)
+        self._beside.append(np.concatenate([masses, recorded.row_sum[..., None]], axis=-1))
+        if recorded.contribution is not None:
+            self._beside.append(recorded.contribution)
         self.rows.append(recorded.rows)
-        arrays = self.arrays(recorded, key_role)
-        del arrays[f"{self.layout.name}/rows"]
-        self.others.append(arrays)
+        self._segments.append(segments)
+        # Roles and masks are mostly those of the replan before.
+        same = bool(self._roles) and np.array_equal(self._roles[-1], key_role)
+        self._roles.append(self._roles[-1] if same else key_role.copy())
+        uniform = np.ascontiguousarray(self._given_uniform(recorded, key_role))
+        known = hashlib.sha256(repr(uniform.shape).encode() + uniform.tobytes()).digest()
+        if known not in self._uniforms:
+            self._uniforms[known] = len(self._uniforms), uniform.copy()
+        self._uniform.append(self._uniforms[known][0])
 
     def finish(self) -> dict[str, ArrayRecord]:
-        """Write the last rows and all other arrays of the site; returns shape and digest of those in shards."""
-        if not self.others:
+        """Write the last rows and all other arrays of the site; returns shapes and digests."""
+        if not self._segments:
             raise ValueError("an episode without replans cannot be committed")
-        name = self.layout.name
-        self.segments = merge_segments(self.layout, (segments for segments, _ in self.masses))
+        name, written = self.layout.name, dict[str, ArrayRecord]()
+        self.segments = merge_segments(self.layout, self._segments)
         column = {segment: i for i, segment in enumerate(self.segments)}
-        columns = [[column[segment] for segment in segments] for segments, _ in self.masses]
-        atoms = np.zeros((len(columns), *self.shape, len(column) + 1), dtype=np.float32)
-        for replan, (at, (_, masses)) in enumerate(zip(columns, self.masses, strict=True)):
-            atoms[replan][..., at] = masses
-        atoms[..., -1] = self._of_replans("row_sum")
-        self.write(f"{name}/atoms", atoms, ATOM_AXES)
+        given = 1 + self.recording.contributions
+
+        def of_replans(kind: str, axes: tuple[str, ...], values_of: Callable[[int, list[int]], NDArray[Any]]) -> None:
+            array = GrowingArray(self.group, self.folder, f"{name}/{kind}", axes)
+            for replan, segments in enumerate(self._segments):
+                array.append(values_of(replan, [*(column[segment] for segment in segments), len(column)])[None])
+            written[f"{name}/{kind}"] = array.finish()
+
+        def atoms(replan: int, places: list[int]) -> NDArray[np.float32]:
+            values = np.zeros((*self.shape, len(column) + 1), dtype=np.float32)
+            values[..., places] = self._beside.part(given * replan)
+            return values
+
+        def contributions(replan: int, places: list[int]) -> NDArray[np.float32]:
+            # A segment that a replan lacks contributes nothing there; the last part is the whole attention update.
+            values, parts = np.zeros((*self.shape[:2], *[len(column) + 1] * 2), dtype=np.float32), np.array(places)
+            values[..., parts[:, None], parts] = self._beside.part(given * replan + 1)
+            return values
+
+        of_replans("atoms", ATOM_AXES, atoms)
         if self.recording.contributions:
-            grams = np.zeros((len(columns), *self.shape[:2], len(column) + 1, len(column) + 1), dtype=np.float32)
-            for replan, (at, gram) in enumerate(zip(columns, self._of_replans("contribution"), strict=True)):
-                # A segment that a replan lacks contributes nothing there; the last part is the whole attention update.
-                parts = np.array([*at, len(column)])
-                grams[replan][..., parts[:, None], parts] = gram
-            self.write(f"{name}/contribution", grams, CONTRIBUTION_AXES)
-        roles = np.stack(self._of_replans("key_role"))
-        self.write(f"{name}/key_role", roles, ("replan", "key"))
-        return {f"{name}/rows": self.rows.finish(ROW_AXES)} | self._write_uniform(roles)
+            of_replans("contribution", CONTRIBUTION_AXES, contributions)
+        of_replans("key_role", ("replan", "key"), lambda replan, _: self._roles[replan])
+        self._beside.close()
+        return written | {f"{name}/rows": self.rows.finish(ROW_AXES)} | self._write_uniform()
 
-    def _of_replans(self, kind: str) -> list[NDArray[Any]]:
-        return [arrays[f"{self.layout.name}/{kind}"][0] for arrays in self.others]
-
-    def _write_uniform(self, key_role: NDArray[np.uint8]) -> dict[str, ArrayRecord]:
+    def _write_uniform(self) -> dict[str, ArrayRecord]:
         """Write what uniform attention gives, once along every axis along which it is the same.
 
-        Nothing is written where every query sees all keys that the roles (replan, key) let it see.
+        Nothing is written where every query sees all keys that the roles let it see.
         """
-        uniforms = self._of_replans("uniform")
-        cells = np.broadcast_shapes(*(uniform.shape for uniform in uniforms))
-        uniform = np.stack([np.broadcast_to(of_replan, cells) for of_replan in uniforms])
-        if (uniform == stored_uniform_of_roles(key_role)).all():
+        cells = np.broadcast_shapes(*(uniform.shape for _, uniform in self._uniforms.values()))
+        each = [np.broadcast_to(uniform, cells) for _, uniform in self._uniforms.values()]
+        pairs = {(number, roles.tobytes()): roles for number, roles in zip(self._uniform, self._roles, strict=True)}
+        if all((each[number] == stored_uniform_of_roles(roles[None])[0]).all() for (number, _), roles in pairs.items()):
             return {}
-        for axis in range(uniform.ndim - 1):
-            first = uniform.take([0], axis=axis)
-            uniform = first if (uniform == first).all() else uniform
+        for axis in range(len(cells) - 1):
+            firsts = [uniform.take([0], axis=axis) for uniform in each]
+            if all((uniform == first).all() for uniform, first in zip(each, firsts, strict=True)):
+                each = firsts
+        numbers = self._uniform[:1] if all((uniform == each[0]).all() for uniform in each) else self._uniform
         # In the layout of rows: masks may differ in as many ways, and an analysis reads its layers only.
-        name = f"{self.layout.name}/uniform"
-        shard = ShardWriter(self.group, self.folder, name, uniform.shape[1:], FLOAT32_MANTISSA_BITS)
-        for of_replan in uniform:
-            shard.append(of_replan)
+        name, lengths = f"{self.layout.name}/uniform", (len(numbers), *each[0].shape)
+        shard = ShardWriter(self.group, self.folder, name, lengths[1:], FLOAT32_MANTISSA_BITS)
+        for number in numbers:
+            shard.append(each[number])
         # Axes of one name have one length in a group, or xarray does not open it.
-        lengths = zip(ROW_AXES, uniform.shape, (len(uniforms), *self.shape, self.layout.num_keys), strict=True)
-        return {name: shard.finish([axis if n == m else f"any_{axis}" for axis, n, m in lengths])}
+        whole = (len(self._uniform), *self.shape, self.layout.num_keys)
+        axes = [axis if n == m else f"any_{axis}" for axis, n, m in zip(ROW_AXES, lengths, whole, strict=True)]
+        return {name: shard.finish(axes)}

@@ -255,6 +255,7 @@ class RecordedRun:
     def _store_call(self, call: WatchedCall, rows: Sequence[RowOfCall], replan: Replan, count: int | None) -> None:
         rows_of_sites = call.finish()
         self._check_contributions(call)
+        call.release()
         if count is not None:
             check_length("actions", replan.actions, count)
         replan.recorded = True

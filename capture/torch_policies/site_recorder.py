@@ -270,6 +270,14 @@ class ReplanRecorder(CallOrder):
                 )
         return rows_of_sites
 
+    def release(self) -> None:
+        """Let go of all tensors: a recorder is in cycles, and Python looks for those now and then only."""
+        self._rows.clear()
+        self._uniform.clear()
+        self._uniform_before.clear()
+        self._changes.clear()
+        self.contributions = ReplanContributions(self.rows, self.early_roles)
+
     def _stacked(self, calls: _OfCalls, recording: Recording) -> NDArray[np.float32]:
         """What calls gave, (layer, denoise, row of the batch, head, query, key), off the device in one transfer.
 

@@ -116,14 +116,7 @@ def _array_problems(
 ) -> Iterator[str]:
     """One pass over an array: its digest, and the rule for its numbers. `wrong`: arrays whose shapes do not fit."""
 
-    @cache
-    def whole(beside: str) -> NDArray[Any]:
-        site, _, kind = beside.partition("/")
-        if (f"{site}/atoms" if kind == "row_sum" else beside) in wrong:
-            raise CorruptEpisode(f"{beside} does not fit the episode")
-        if kind == "row_sum":  # without a search for missing values: other masses of the replan may be no numbers
-            return np.asarray(episode.read_stored(f"{site}/atoms", 0, episode.attributes.num_replans)[..., -1])
-        return episode.uniform(site) if kind == "uniform" else episode.read(beside)
+    uniform = cache(episode.uniform)
 
     digest, problems = ArrayDigest(), list[str]()
     step = episode.reading_step(name)
@@ -132,9 +125,16 @@ def _array_problems(
         digest.update(stored)
         values = episode.values_of(name, stored)
 
-        def of_block(beside: str, first: int = first) -> NDArray[Any]:
-            # What uniform attention gives may be stored once for all replans.
-            return whole(beside)[first : first + step] if len(whole(beside)) > 1 else whole(beside)
+        def of_block(beside: str, first: int = first, count: int = len(stored)) -> NDArray[Any]:
+            site, _, kind = beside.partition("/")
+            source = f"{site}/atoms" if kind == "row_sum" else beside
+            if source in wrong:
+                raise CorruptEpisode(f"{beside} does not fit the episode")
+            if kind == "uniform":  # it may be stored once for all replans
+                return uniform(site)[first : first + count] if len(uniform(site)) > 1 else uniform(site)
+            given = episode.read_stored(source, first, first + count)
+            # Without a search for missing values: other masses of the replan may be no numbers.
+            return np.asarray(given[..., -1]) if kind == "row_sum" else episode.values_of(source, given)
 
         if not problems:  # the first block with a fault names its place
             with suppress(CorruptEpisode):  # of an array beside it, which is reported where that one is read
