@@ -132,8 +132,11 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
     return Table(columns, rows)
 
 
-def full_size_table(device: str, threads: int) -> Table:
-    """One call as it is, and with effects of some numbers of items: seconds, policy calls, and the most memory."""
+def full_size_table(device: str, threads: int, policy=None) -> Table:
+    """One call as it is, and with effects of some numbers of items: seconds, policy calls, and the most memory.
+
+    policy: one of full size unless given.
+    """
     import numpy as np
     import torch
     from capture_overhead import make_policy, prepared_input
@@ -144,7 +147,7 @@ def full_size_table(device: str, threads: int) -> Table:
     from vla_attention.capture.interventions.changed_inputs import CallContext
 
     torch.set_num_threads(threads)
-    policy = make_policy("full", device, "bfloat16")
+    policy = policy or make_policy("full", device, "bfloat16")
     forget_peak(device)
     model = largest_memory(device)
     given, context = prepared_input(policy), CallContext(0, 0, 0)

@@ -116,7 +116,12 @@ def attend(
 
 
 class RowCollector(Protocol):
-    """Receives rows. A model asks it for a receiver at every block and denoise step."""
+    """Receives rows. A model asks it for a receiver at every block and denoise step.
+
+    listens_to_modules: whether it hears of modules by hooks, which those of a compiled graph do not call.
+    """
+
+    listens_to_modules: bool = False
 
     def begin_call(self, allowed: Tensor, lasting: slice, pieces: Sequence[slice] | None) -> None:
         """Learn about the keys before the first denoise step; a model that does not know them does not call it.

@@ -53,6 +53,7 @@ def all_finite(actions: NDArray[np.floating] | None, recorded: Mapping[str, Reco
 class _Watch(RowCollector):
     """Knows which block computes, and keeps the first module whose numbers are not finite."""
 
+    listens_to_modules = True
     position: str = "before the first denoise step"
     origin: str | None = field(default=None)
 

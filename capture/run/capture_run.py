@@ -173,6 +173,8 @@ def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: 
     asked, single = settings.policy_batch, ""
     if not isinstance(policy, BatchPolicy):
         single = f": policies of the kind {policy.family} make one call"
+    elif "compiled" in policy.identity().config:
+        single = " with --compile, whose graph is of one call"
     elif settings.interventions.changes_attention:
         single = " with interventions on attention, whose calls are made one by one"
     if single and asked is not None and asked > 1:

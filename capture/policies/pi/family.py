@@ -71,6 +71,11 @@ class PiSettings(ModelSettings):
         None,
     )
     asset_id: str | None = option("which statistics, where the checkpoint's assets have several", None)
+    compile: bool = option(
+        "run the denoise steps as one graph of torch.compile: the first call takes minutes, the others less time on a "
+        "GPU; calls are then made one by one",
+        False,
+    )
     camera: tuple[str, ...] = option(
         f"what one camera of the policy sees: {' or '.join(CAMERAS)} of the simulators, or a column of a data set; "
         f"{NONE} leaves it black and masked (default: that of the checkpoint's evaluation, or the column of the same "
@@ -95,7 +100,10 @@ class PiSettings(ModelSettings):
         """Load the policy; see `build_pi_policy`."""
         from vla_attention.capture.policies.pi.loading import build_pi_policy
 
-        return build_pi_policy(self, device)
+        policy = build_pi_policy(self, device)
+        if self.compile:
+            policy.compile_steps()
+        return policy
 
     def check_files(self) -> None:
         """See `check_pi_files`."""
@@ -115,6 +123,7 @@ class PiSettings(ModelSettings):
             same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
         same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
         same |= {name: facts[name] for name in ("asset_id", "config_name") if name in facts}
+        same["compile"] = "compiled" in facts
         if identity.checkpoint_format == "seeded":
             return {"checkpoint": identity.name, **same}
         if identity.checkpoint_format.startswith("openpi"):

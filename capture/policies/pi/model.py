@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vla_attention.capture.policies.pi.compiled import CompiledSteps
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaModel, KeysValues, Rotation
@@ -114,6 +115,8 @@ class PiModel(nn.Module):
             self.action_time_mlp_out = nn.Linear(expert, expert)
         self._place_precision(dtype)
         self.eval()
+        #: Makes the denoise steps of calls of one row whose attention is not changed, where it was asked for.
+        self.compiled: CompiledSteps | None = None
 
     def _place_precision(self, dtype: torch.dtype) -> None:
         if dtype not in (torch.float32, torch.bfloat16):
@@ -277,13 +280,15 @@ class PiModel(nn.Module):
         prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask), editor)
         suffix_positions = torch.arange(config.suffix_len, device=noise.device)
         valid = prefix.valid.to(noise.device)
+        listens = recorder is not None and recorder.listens_to_modules
+        compiled = self.compiled if noise.shape[0] == 1 and editor is None and not listens else None
         positions = valid.sum(dim=1, keepdim=True) + suffix_positions
         denoising = Denoising(
             state,
             Rotation.at(positions, config.action_expert.head_dim),
             self.suffix_mask(valid),
             prefix.cache,
-            pieces_of_keys(config, prefix.valid, noise.device),
+            pieces_of_keys(config, prefix.valid, noise.device) if compiled is None else None,
         )
         if recorder is not None:
             lasting = slice(0, valid.shape[1])
@@ -292,7 +297,11 @@ class PiModel(nn.Module):
         steps = config.num_denoise_steps if num_steps is None else num_steps
         x = noise
         for step, waves in enumerate(self.time_waves(steps)):
-            x = x + (-1.0 / steps) * self.velocity(x, step, waves, denoising, recorder, editor)
+            if compiled is not None:
+                velocity = compiled.velocity(x, step, waves, denoising, recorder)
+            else:
+                velocity = self.velocity(x, step, waves, denoising, recorder, editor)
+            x = x + (-1.0 / steps) * velocity
         return x
 
     def velocity(

@@ -17,6 +17,7 @@ from vla_attention.capture.machine import memory_left_on
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.noise import initial_noise, noise_seed
 from vla_attention.capture.policies.pi.call_variants import ModelCall, call_bytes, most_calls, sample_variants
+from vla_attention.capture.policies.pi.compiled import CompiledSteps
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.model import PiModel
@@ -89,6 +90,19 @@ class PiPolicy:
         self.needs_camera_frames = not processing.whole_grey_levels
         self._warned: set[str] = set()
 
+    def compile_steps(self) -> None:
+        """Make denoise steps by one compiled graph from here on, and say what that takes; see `compiled.py`."""
+        self.model.compiled = CompiledSteps(self.model)
+        config = self.model.config
+        numbers = self.num_layers * config.suffix_len * (self.num_heads * self.sites[0].num_keys)
+        print(
+            "The denoise steps are compiled at the first policy call, which takes a minute or more. At every step the "
+            f"graph gives the rows of all {self.num_layers} layers ({4 * numbers / 1e6:.1f} MB), whether or not they "
+            "are recorded.",
+            file=sys.stderr,
+            flush=True,
+        )
+
     def query_pools(self) -> NDArray[np.float64]:
         """Return the weights (pool, action query): every query is one action step."""
         return np.eye(self.num_action_queries)
@@ -116,6 +130,8 @@ class PiPolicy:
             "long_prompts": "cut" if self.processing.cut_long_prompts else "refused",
             "tokenizer_digest": self.tokenizer.digest,
         }
+        if self.model.compiled is not None:
+            facts["compiled"] = "denoise steps"
         if not self.robot.turned:
             facts["robot"] = to_json(self.robot)
         return describe_policy(self, self.source, self._digest, facts)
