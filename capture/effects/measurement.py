@@ -75,6 +75,8 @@ class EffectMeasurement:
     no_pictures: str = (
         "Cameras' pictures are exchanged for grey ones; --effects-pictures STORE takes the task's mean ones."
     )
+    #: Whether it says what the first measured call took.
+    says_seconds: bool = False
     #: See `EpisodeEffects`; None before it was looked at.
     silent_blocks: tuple[str, ...] | None = field(default=None, init=False)
     #: Replans whose effects were refused.
@@ -193,7 +195,8 @@ def measurement_of(
     if known and planned.groups:
         groups = Interventions(keys=tuple(KeyKnockout(selector) for selector in planned.groups.values()))
         RunChanges(groups, instructions).check_names(policy.sites)
-    return EffectMeasurement(policy, planned, siblings_of(known), say, pictures, tuple(instructions.values()))
+    siblings, told = siblings_of(known), tuple(instructions.values())
+    return EffectMeasurement(policy, planned, siblings, say, pictures, told, says_seconds=True)
 
 
 @dataclass
@@ -253,14 +256,18 @@ class EpisodeEffectsMeasured:
         for name, selector in planned.groups.items():
             if selector not in cut:
                 self.run.say_once(f"The group '{name}' has no key at some replans: it is not measured there.")
-        actions_of = self.run.actions_of(variants)
-        if planned.denoise_steps < policy.num_denoise_steps:
-            # Fewer steps change the actions by themselves: the same call with as many steps is what effects are of.
+        actions_of, reference = self.run.actions_of(variants), actions
+        if UNCHANGED in self.conditions:
+            # Made as the changed calls are: in their batch, never compiled, with as many denoise steps.
             unchanged = self.conditions.index(UNCHANGED)
-            actions = actions_of.pop(unchanged, actions)
+            reference = actions_of.get(unchanged, actions)
+            if planned.denoise_steps < policy.num_denoise_steps:  # which change the actions by themselves
+                actions_of.pop(unchanged, None)
         changes = {
-            number: ((given - actions) / self.run.units).astype(np.float32) for number, given in actions_of.items()
+            number: ((given - reference) / self.run.units).astype(np.float32) for number, given in actions_of.items()
         }
+        if UNCHANGED in self.conditions and unchanged in changes:  # how far it is from what the robot executed
+            changes[unchanged] = ((reference - actions) / self.run.units).astype(np.float32)
         measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
         weights = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
@@ -274,6 +281,9 @@ class EpisodeEffectsMeasured:
             else np.zeros((0, *actions.shape), np.float32)
         )
         self.run.seconds.append(time.perf_counter() - begun)
+        if len(self.run.seconds) == 1 and self.run.says_seconds:
+            took = f"{plural(len(variants), 'changed call')} took {self.run.seconds[0]:.1f} s"
+            self.run.say(f"Effects: {took} at the first policy call that is measured.")
         units = tuple(float(unit) for unit in self.run.units)
         silent = self.run.silent_blocks or ()
         return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent)

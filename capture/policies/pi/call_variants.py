@@ -19,12 +19,19 @@ from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
 from vla_attention.capture.recording.attention import CallKeys, FactorEditor, LogitChange, log_factors
 
-#: Bytes of the logits of one block that a batch may have: beyond it, larger batches gain nothing.
+#: Bytes of the logits of one block that a batch may have on a processor: beyond it, larger batches gain nothing.
 _MOST_LOGITS = 1 << 28
+#: More than there are conditions of a call.
+_MOST_CALLS_OF_GPU = 1 << 10
 
 
-def most_calls(config: PiConfig, num_keys: int) -> int:
-    """Return the number of calls whose logits of one prefix block take `_MOST_LOGITS`; num_keys: of the prefix."""
+def most_calls(config: PiConfig, num_keys: int, device: torch.device) -> int:
+    """Return the number of calls whose logits of one prefix block take `_MOST_LOGITS`; num_keys: of the prefix.
+
+    On a GPU, where larger batches do gain, memory alone limits them.
+    """
+    if device.type != "cpu":
+        return _MOST_CALLS_OF_GPU
     return max(1, _MOST_LOGITS // (4 * config.paligemma.num_heads * num_keys**2))
 
 
@@ -63,6 +70,10 @@ class _Prefix:
 def sample_variants(model: PiModel, calls: Sequence[ModelCall], num_steps: int, batch: int) -> Tensor:
     """Return the actions (call, horizon, action dim) float32, still normalised.
 
+    What bfloat16 rounds differs from batch to batch by more than small effects. The first call is then made in every
+    batch, and the others are moved by as much as it differs from its first time: a call that is the same gives the same
+    to the bit.
+
     num_steps: denoise steps. batch: calls that are made at a time, at most.
     """
     inputs = _Inputs(model)
@@ -77,11 +88,16 @@ def sample_variants(model: PiModel, calls: Sequence[ModelCall], num_steps: int, 
         # Calls with a prefix of their own first: in the batches after them, all share one.
         ordered = sorted(of_mask, key=lambda i: (prefixes[i].editor is None, prefixes[i].number))
         group = _Group(model, inputs, np.flatnonzero(valid), num_steps)
-        size = min(batch, most_calls(model.config, len(group.real)))
-        for first in range(0, len(ordered), size):
-            chosen = ordered[first : first + size]
+        size = min(batch, most_calls(model.config, len(group.real), model.device))
+        again = [0] if 0 in ordered and len(ordered) > size > 1 and model.dtype is torch.bfloat16 else []
+        ordered = [i for i in ordered if i not in again]
+        for first in range(0, len(ordered), size - len(again)):
+            chosen = again + ordered[first : first + size - len(again)]
             made = group.sample([calls[i] for i in chosen], [prefixes[i] for i in chosen])
-            for i, one in zip(chosen, made, strict=True):
+            if again and actions[0] is None:
+                actions[0] = made[0]
+            moved = made - made[:1] + actions[0] if again and actions[0] is not None else made
+            for i, one in list(zip(chosen, moved, strict=True))[len(again) :]:
                 actions[i] = one
     return torch.stack([one for one in actions if one is not None])
 

@@ -292,7 +292,10 @@ class PiPolicy:
         config, device = self.model.config, self.model.device
         number = self.model.action_in_proj.weight.element_size()
         return VariantMemory(
-            call_bytes(config, number), most_calls(config, config.prefix_len), memory_left_on(device), str(device)
+            call_bytes(config, number),
+            most_calls(config, config.prefix_len, device),
+            memory_left_on(device),
+            str(device),
         )
 
     def action_units(self) -> NDArray[np.float64]:

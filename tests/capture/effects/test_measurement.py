@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from tests.capture.interventions.test_interventions_on_policies import policy_named
 from tests.kit.cosmos_helpers import INSTRUCTION
@@ -21,6 +22,10 @@ from vla_attention.capture.interventions.resolution import (
     run_vocabularies,
     site_tokens,
 )
+from vla_attention.capture.policies.pi.call_variants import _Group
+from vla_attention.capture.policies.pi.embedded import random_weights
+from vla_attention.capture.policies.pi.model import model_from_state
+from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.policy import CallVariant
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -263,3 +268,26 @@ def test_the_other_noise_is_another_one_whatever_the_seed():
         planned = planned_effects(EffectSettings(("text",)), policy, seed)
         assert planned.seed != seed
         assert 0 <= planned.seed < 2**63
+
+
+def test_in_bfloat16_a_call_that_is_the_same_gives_the_same_to_the_bit(monkeypatch):
+    """What bfloat16 rounds depends on the batch, which a processor does not show: here the batch itself is added."""
+    sample, batches = _Group.sample, []
+
+    def of_batch(group, calls, prefixes):
+        batches.append(len(calls))
+        return sample(group, calls, prefixes) + 0.01 * len(batches)
+
+    monkeypatch.setattr(_Group, "sample", of_batch)
+    config = policy_named("pi05").model.config
+    model = model_from_state(config, random_weights(config, 0), dtype=torch.bfloat16)
+    policy = policy_named("pi05")
+    policy = PiPolicy(model, policy.tokenizer, policy.processing, policy.source)
+    given, _, _ = call_of(policy)
+    variants = [CallVariant(given, seed) for seed in (11, 12, 13, 11, 14, 15, 11, 16)]
+    for batch, sizes in ((3, [3, 3, 3, 2]), (5, [5, 4]), (8, [8])):
+        made = policy.act_variants(variants, policy.num_denoise_steps, batch)
+        for number, variant in enumerate(variants):
+            assert np.array_equal(made[number], made[0]) is (variant.noise_seed == 11)
+        assert batches == sizes
+        batches.clear()
