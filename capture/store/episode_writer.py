@@ -135,6 +135,8 @@ class EpisodeWriter:
         self.prompts: dict[Prompt, int] = {}
         #: Of the replans, without what is written.
         self.records: list[ReplanRecord] = []
+        #: Whether a part of a replan was written and the rest was not.
+        self._broken = False
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._growing: dict[str, GrowingArray] = {}
         #: (1, step, action_dim) of each replan, as many steps as the data set has from there on.
@@ -153,7 +155,7 @@ class EpisodeWriter:
                 f"Cannot store replan {len(self.records)} (environment step {record.env_step}) of {self.what}: "
                 f"{problem}."
             )
-        with self._as_its_holder():
+        with self._as_its_holder(), self._wholly():
             for name, site in self.sites.items():
                 site.append(record.rows[name], record.key_role[name])
             for name, (values, axes) in record.arrays.items():
@@ -166,6 +168,20 @@ class EpisodeWriter:
         self.prompts.setdefault(record.prompt, len(self.prompts))
         self._shapes = self._shapes or _shapes_of_replan(record)
         self.records.append(self._without_arrays(record))
+
+    @contextmanager
+    def _wholly(self) -> Iterator[None]:
+        """Refuse every further replan, and the end of the episode, if what is written in the block fails."""
+        if self._broken:
+            raise StoreWriteFailed(f"A replan of {self.what} was not written wholly; nothing can be added to it.")
+        self._broken = True
+        yield
+        self._broken = False
+
+    def close(self) -> None:
+        """Give back what waits on the disk; called once, whether or not the episode was committed."""
+        for site in self.sites.values():
+            site.close()
 
     def _without_arrays(self, record: ReplanRecord) -> ReplanRecord:
         """The facts of a replan alone; conditions of effects are those of the replans before it."""
@@ -255,7 +271,7 @@ class EpisodeWriter:
             RunMismatch: the store has been replaced by one of another run meanwhile.
             StoreWriteFailed: the disk is full, or refuses in another way.
         """
-        with self._as_its_holder():
+        with self._as_its_holder(), self._wholly():
             self._check_store()
             self._check_lock()
             for site in self.sites.values():

@@ -141,5 +141,5 @@ class SpilledArrays:
         self._size = 0
 
     def close(self) -> None:
-        """Give the file back."""
+        """Give the file back; nothing happens the second time."""
         self._file.close()

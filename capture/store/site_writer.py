@@ -103,11 +103,15 @@ class ShardWriter:
         """Write the index (offset and length of every chunk, in the order of the chunk grid) and the metadata."""
         if self._waiting:
             self._flush()
-        self._waiting.close()
+        self.close()
         self.file.finish()
         shape = (self.num_replans, *self.cells)
         create_rows(self.group, self.name, shape, (self.block, self.keys), axes, self.codec)
         return ArrayRecord(shape, self.digest.hexdigest())
+
+    def close(self) -> None:
+        """Give back what waits on the disk."""
+        self._waiting.close()
 
 
 class SiteWriter:
@@ -124,7 +128,8 @@ class SiteWriter:
         #: Of each replan its own segments, and what uniform attention gives, by its number among the different ones.
         self._segments: list[tuple[Segment, ...]] = []
         self._uniform: list[int] = []
-        self._uniforms: dict[bytes, tuple[int, NDArray[np.float32]]] = {}
+        self._numbers: dict[bytes, int] = {}
+        self._uniforms: KeptArrays | SpilledArrays | None = None
         self._roles: list[NDArray[np.uint8]] = []
         #: Of each replan the masses of its segments, with the sums of rows behind them, and its contributions.
         self._beside = _waiting(folder, "<f4", 8 * 4 * math.prod(self.shape) > _MOST_BESIDE)
@@ -165,9 +170,18 @@ class SiteWriter:
         self._roles.append(self._roles[-1] if same else key_role.copy())
         uniform = np.ascontiguousarray(self._given_uniform(recorded, key_role))
         known = hashlib.sha256(repr(uniform.shape).encode() + uniform.tobytes()).digest()
-        if known not in self._uniforms:
-            self._uniforms[known] = len(self._uniforms), uniform.copy()
-        self._uniform.append(self._uniforms[known][0])
+        if self._uniforms is None:
+            self._uniforms = _waiting(self.folder, "<f4", uniform.nbytes > _MOST_BESIDE)
+        if known not in self._numbers:
+            self._numbers[known] = len(self._numbers)
+            self._uniforms.append(uniform.copy())
+        self._uniform.append(self._numbers[known])
+
+    def close(self) -> None:
+        """Give back what waits on the disk."""
+        for waiting in (self.rows, self._beside, self._uniforms):
+            if waiting is not None:
+                waiting.close()
 
     def finish(self) -> dict[str, ArrayRecord]:
         """Write the last rows and all other arrays of the site; returns shapes and digests."""
@@ -199,30 +213,40 @@ class SiteWriter:
         if self.recording.contributions:
             of_replans("contribution", CONTRIBUTION_AXES, contributions)
         of_replans("key_role", ("replan", "key"), lambda replan, _: self._roles[replan])
-        self._beside.close()
-        return written | {f"{name}/rows": self.rows.finish(ROW_AXES)} | self._write_uniform()
+        written |= {f"{name}/rows": self.rows.finish(ROW_AXES)} | self._write_uniform()
+        self.close()
+        return written
 
     def _write_uniform(self) -> dict[str, ArrayRecord]:
         """Write what uniform attention gives, once along every axis along which it is the same.
 
         Nothing is written where every query sees all keys that the roles let it see.
         """
-        cells = np.broadcast_shapes(*(uniform.shape for _, uniform in self._uniforms.values()))
-        each = [np.broadcast_to(uniform, cells) for _, uniform in self._uniforms.values()]
+        uniforms = self._uniforms
+        assert uniforms is not None
+
+        def whole(number: int) -> NDArray[np.float32]:
+            return np.broadcast_to(uniforms.part(number), cells)
+
+        cells: tuple[int, ...] = np.broadcast_shapes(*(uniforms.part(number).shape for number in range(len(uniforms))))
         pairs = {(number, roles.tobytes()): roles for number, roles in zip(self._uniform, self._roles, strict=True)}
-        if all((each[number] == stored_uniform_of_roles(roles[None])[0]).all() for (number, _), roles in pairs.items()):
+        if all(
+            (whole(number) == stored_uniform_of_roles(roles[None])[0]).all() for (number, _), roles in pairs.items()
+        ):
             return {}
-        for axis in range(len(cells) - 1):
-            firsts = [uniform.take([0], axis=axis) for uniform in each]
-            if all((uniform == first).all() for uniform, first in zip(each, firsts, strict=True)):
-                each = firsts
-        numbers = self._uniform[:1] if all((uniform == each[0]).all() for uniform in each) else self._uniform
+        same = [True] * (len(cells) - 1)
+        for number in range(len(uniforms)):
+            uniform = whole(number)
+            same = [one and bool((uniform == uniform.take([0], axis)).all()) for axis, one in enumerate(same)]
+        once = tuple(slice(1) if one else slice(None) for one in same)
+        alike = all((whole(number) == whole(0)).all() for number in range(1, len(uniforms)))
+        numbers = self._uniform[:1] if alike else self._uniform
         # In the layout of rows: masks may differ in as many ways, and an analysis reads its layers only.
-        name, lengths = f"{self.layout.name}/uniform", (len(numbers), *each[0].shape)
+        name, lengths = f"{self.layout.name}/uniform", (len(numbers), *whole(0)[once].shape)
         shard = ShardWriter(self.group, self.folder, name, lengths[1:], FLOAT32_MANTISSA_BITS)
         for number in numbers:
-            shard.append(each[number])
+            shard.append(whole(number)[once])
         # Axes of one name have one length in a group, or xarray does not open it.
-        whole = (len(self._uniform), *self.shape, self.layout.num_keys)
-        axes = [axis if n == m else f"any_{axis}" for axis, n, m in zip(ROW_AXES, lengths, whole, strict=True)]
+        full = (len(self._uniform), *self.shape, self.layout.num_keys)
+        axes = [axis if n == m else f"any_{axis}" for axis, n, m in zip(ROW_AXES, lengths, full, strict=True)]
         return {name: shard.finish(axes)}

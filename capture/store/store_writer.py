@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -70,7 +70,8 @@ class RunStore:
                 writer = EpisodeWriter(
                     self.path, self.attributes, folder, start, denoise_times, self.locks, self.durable
                 )
-            yield writer
+            with closing(writer):
+                yield writer
 
 
 def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable: bool = True) -> RunStore:

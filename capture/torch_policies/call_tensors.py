@@ -77,7 +77,7 @@ class Masks:
 
     def __init__(self) -> None:
         self._known: dict[tuple[Any, ...], tuple[Tensor | None, SeenKeys]] = {}
-        #: By the shape of rows: (batch, query, key) bool, which keys had mass for some head, and which are seen.
+        #: By the shape of rows: (batch, head, query, key) bool, which keys had mass, and which are seen.
         self._by_mass: dict[torch.Size, tuple[Tensor, Tensor]] = {}
 
     def seen(
@@ -98,8 +98,9 @@ class Masks:
             return _seen(mask, causal, queries, sizes, device)
         before, known = self._known.get(key, (None, None))
         if known is None or (mask is not None and before is not None and not torch.equal(mask, before)):
+            mask = None if mask is None else mask.clone()  # the policy may write over its own
             known = _seen(mask, causal, queries, sizes, device)
-            self._known[key] = None if mask is None else mask.clone(), known
+            self._known[key] = mask, known
         return known
 
     def seen_by(self, rows: Tensor, shown: Tensor, sinks: int, *, alike: bool) -> Tensor:
@@ -113,7 +114,7 @@ class Masks:
         """
         massive = None
         if alike and rows.device.type == "cpu":
-            massive = (rows > NO_MASS).any(dim=1)
+            massive = rows > NO_MASS
             before, known = self._by_mass.get(rows.shape, (None, None))
             if known is not None and before is not None and torch.equal(massive, before):
                 return known

@@ -67,11 +67,10 @@ def watch_sdpa(
     if isinstance(given.attn_mask, CausalBias):  # it has no numbers of its own
         given = structs.replace(given, attn_mask=given.attn_mask._materialize(query.device))
 
+    path, module = mode.where()
+
     def find_out() -> tuple[CallShape, tuple[list[int], int, int]]:
-        dtype = query.dtype
-        if torch.is_autocast_enabled(query.device.type):
-            dtype = torch.get_autocast_dtype(query.device.type)
-        path, module = mode.where()
+        dtype = query.dtype if autocast is None else autocast
         lead, keys = _lead(given), key.shape[-2]
         batch, kernel_heads = batch_and_heads(lead, module)
         kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
@@ -80,8 +79,10 @@ def watch_sdpa(
         return mode.new_shape(path, "sdpa", sizes, dtype), (lead, kernel_heads, group)
 
     shapes = (query.shape, key.shape, given.value.shape, None if given.attn_mask is None else given.attn_mask.shape)
-    kind = ("sdpa", *shapes, given.enable_gqa, query.dtype, torch.is_autocast_enabled(query.device.type))
-    shape, (lead, kernel_heads, group) = mode.facts(kind, find_out)
+    device = query.device.type
+    autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
+    kind = (path, "sdpa", *shapes, given.enable_gqa, query.dtype, autocast)
+    shape, (lead, kernel_heads, group) = mode.shape_of(kind, find_out)
     batch, heads, queries, keys = shape.batch, shape.heads, shape.queries, shape.keys
     kernel_queries, dim = query.shape[-2], query.shape[-1]
 

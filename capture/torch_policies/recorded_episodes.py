@@ -161,7 +161,7 @@ class Episode:
             "largest P·V error": f"{self.largest_error:.3g}",
             "replan blocks without attention": str(self.num_dropped),
             "watched throughout": f"{self.num_whole} of {self.num_replans} replan blocks, with P·V of every call; the "
-            "others where attention ran before, with P·V of one block of each site",
+            "others in modules that computed attention before, with P·V of one block of each site",
         }
         writer.start = replace(writer.start, provenance=facts)
         self.run._check_weights()

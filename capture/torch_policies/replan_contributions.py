@@ -115,7 +115,8 @@ class ReplanContributions:
                 each.mul_(of_row[:, None])
             total, theirs = each.sum(dim=1), added[row, queries].float()
             mismatch = (total + constant * of_row - theirs).abs().amax()
-            if not float(mismatch) <= allowed * float(theirs.abs().amax()):
+            # Relative to what the keys give: a large bias is no part of it.
+            if not float(mismatch) <= allowed * float(total.abs().amax()):
                 return None
             there = there or bool(total.any()) or not bool(parts.any())
             grams.append(gram_matrix(each, total))

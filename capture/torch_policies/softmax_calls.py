@@ -109,8 +109,10 @@ class Softmaxes:
         #: All that met none yet, by their numbers, and the last function of what is followed.
         self.unmet: dict[int, tuple[CallShape, str]] = {}
         self._count = 0
-        #: Those that met values.
+        #: Those that met values, the kinds of all, and kinds of those that did not meet any before the next one came.
         self._met: set[int] = set()
+        self._kinds: dict[int, tuple[Any, ...]] = {}
+        self._doubtful: set[tuple[Any, ...]] = set()
         #: Module and number of keys -> the function that selected some of them.
         self._selected: dict[tuple[str, int], str] = {}
 
@@ -124,19 +126,19 @@ class Softmaxes:
         if not 3 <= logits.ndim <= 5 or axis not in (-1, logits.ndim - 1):
             return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
+        path, module = self._mode.where()
 
         def find_out() -> tuple[CallShape, None]:
-            path, module = self._mode.where()
             # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
             batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
             sizes = (batch, heads, heads, queries, keys)
             return self._mode.new_shape(path, "softmax", sizes, logits.dtype), None
 
-        kind: tuple[Any, ...] = ("softmax", logits.shape, logits.dtype)
-        met = None if self._mode.changes else self._mode.known(("call", self._mode.place, *kind))
+        kind: tuple[Any, ...] = (path, "softmax", logits.shape, logits.dtype)
+        met = None if self._mode.changes or self.unmet else self._mode.known(("call", *kind))
         if met is not None and self._mode.passes(structs.replace(met, number=self._mode.number)):
             return function(*args, **kwargs)  # nothing of it is wanted
-        shape, _ = self._mode.facts(kind, find_out)
+        shape, _ = self._mode.shape_of(kind, find_out)
         batch, heads = shape.batch, shape.heads
         self._count += 1
         change, given = self._mode.change(shape), logits
@@ -151,10 +153,17 @@ class Softmaxes:
             name = "self" if "self" in kwargs else "input"
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
             self.changed.add(self._count)
+        self._kinds[self._count] = kind
+        if self.unmet:
+            self._doubtful.update(self._kinds[number] for number in (*self.unmet, self._count))
         self.unmet[self._count] = shape, "softmax"
-        kind = self._mode.place, *kind
         self._followed.put(result, _Softmax((self._count,), shape, given.detach(), logits.detach(), change, kind))
         return result
+
+    def learn_unmet(self) -> None:
+        """At the end of a block, note which kinds of softmaxes are not always a part of one attention call each."""
+        for kind in {self._kinds[number] for number in self.unmet} | self._doubtful:
+            self._mode.learn(("call", *kind), None)
 
     def select(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a function that selects numbers, which may be scores of keys."""
@@ -273,7 +282,7 @@ class Softmaxes:
                     "all heads and queries alike, or compute the softmax over (batch, head, query, key)."
                 )
             )
-        alone = len(softmax.numbers) == 1 and softmax.numbers[0] not in self._met
+        alone = len(softmax.numbers) == 1 and softmax.numbers[0] not in self._met and softmax.kind not in self._doubtful
         self._met.update(softmax.numbers)
         self._mode.learn(("call", *softmax.kind), structs.replace(shape, number=0) if alone else None)
         if self._mode.passes(shape):
@@ -288,7 +297,8 @@ class Softmaxes:
                 left = normalised(_wide(softmax.logits))[..., count:].permute(product.rows)
                 rows = torch.cat([rows, left.reshape(*sizes, sinks)], dim=-1)
                 values = nn.functional.pad(values, (0, 0, 0, sinks))
-            seen = self._mode.masks.seen_by(rows, logits, sinks, alike=not self._mode.whole)
+            alike = not self._mode.whole and softmax.change is None
+            seen = self._mode.masks.seen_by(rows, logits, sinks, alike=alike)
         back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
         self._products.put(result, _Made(shape, product.output.index(len(product.rows) - 2)))
         self._mode.saw(

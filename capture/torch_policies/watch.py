@@ -4,8 +4,8 @@ Compiled parts run eager meanwhile, and the fast path of `nn.MultiheadAttention`
 policy's own kernels compute what it returns: with nothing changed, actions are bit-equal with those of the same policy
 run eager with the fast path off.
 
-A mode makes every function of torch pass through Python. Once it is known where a policy computes attention
-(`WatchedPlaces`), the mode is on only there, and as long as something is followed that came of it.
+A mode makes every function of torch pass through Python. Once it is known which modules compute attention
+(`WatchedPlaces`), the mode is on only in them, and as long as something is followed that came of it.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 import threading
 import types
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ import torch
 from msgspec import structs
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
+from torch.utils._device import DeviceContext
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher, exact
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused, Masks
@@ -33,7 +35,8 @@ from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, fin
 from vla_attention.capture.torch_policies.products import PRODUCTS
 from vla_attention.capture.torch_policies.softmax_calls import SELECTIONS, SOFTMAXES, Softmaxes
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.capture.torch_policies.watched_places import OUTSIDE
+from vla_attention.schemas.errors import BadArgument, Note, UserError, listing, plural
 
 #: Runs a function of torch with its arguments, and notes what is known of its result.
 Handler = Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]
@@ -70,7 +73,6 @@ class AttentionMode(TorchFunctionMode):
 
     Attributes:
         outputs: the outputs of attention calls that are followed to the residual stream.
-        place: the one that came last; None for one outside of the policy. See `WatchedPlaces`.
     """
 
     def __init__(self, known: FoundPolicy, watcher: Watcher) -> None:
@@ -98,13 +100,14 @@ class AttentionMode(TorchFunctionMode):
         self._thread = get_ident()
         self._ran_elsewhere = False
         self._places = known.places
-        #: Whether the mode is on throughout, and after which places it is off otherwise.
+        #: Whether every function is watched; else in which modules it is off, and how many others are running.
         self.whole = watcher.whole = known.places.next_is_whole()
         watcher.number = known.places.calls
         self._quiet: Set[int] = frozenset() if self.whole else known.places.quiet
-        #: The place that came last, all of the policy that came, and those with attention behind them.
-        self.place: int | None = 0
-        self._passed, self._attending = {0}, set[int | None]()
+        self._watched = 0
+        #: Ids of the policy's modules that are running, the innermost last, that ran, and that computed attention.
+        self._running: list[int] = []
+        self._ran, self._attending = set[int](), set[int]()
         self._on = False
 
     def __torch_function__(
@@ -134,7 +137,7 @@ class AttentionMode(TorchFunctionMode):
 
     def _attending_here(self, handler: Handler) -> Handler:
         def noting(function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
-            self._attending.add(self.place)
+            self._attending.add(self._running[-1] if self._running else OUTSIDE)
             return handler(function, args, kwargs)
 
         return noting
@@ -278,49 +281,74 @@ class AttentionMode(TorchFunctionMode):
             self.failed(error)
             raise
 
-    def pass_by(self, module: nn.Module, place: int) -> None:
-        """Notice that a module begins or ends, and be on or off from here to the next place; see `WatchedPlaces`.
+    def begin(self, module: nn.Module) -> bool:
+        """Notice that a module begins, and watch it or not; False if its end is of no interest.
 
-        Every module of the policy comes by here twice.
+        Every module that the policy calls comes by here.
         """
+        number = id(module)
         if get_ident() != self._thread:
-            self._ran_elsewhere = self._ran_elsewhere or id(module) in self._paths
-            return
-        self.place = place
-        if self.whole:
-            if id(module) in self._paths:
-                self._passed.add(place)
-            else:
-                self.place = None
-        elif (place in self._quiet) is self._on:
-            self._switch()
-
-    def _switch(self) -> None:
-        """Go on or off the stack of function modes, under what the policy may have put there meanwhile."""
-        above: Sequence[Any] = ()
-        base, height = self._base, torch._C._len_torch_function_stack()
+            self._ran_elsewhere = self._ran_elsewhere or number in self._paths
+            return False
+        if number in self._paths:
+            self._running.append(number)
+            self._ran.add(number)
+            if number in self._quiet:
+                if self._on and not self._watched:
+                    self._leave_stack()
+                return True
+        elif not self._quiet:
+            return False
+        self._watched += 1
         if not self._on:
-            if height > base:
-                above = [torch._C._pop_torch_function_stack() for _ in range(height - base)]
-            torch._C._push_on_torch_function_stack(self)
-        else:
-            # torch takes it off while it is asked about a function, in which modules may run.
-            here = height > base and torch._C._get_function_stack_at(base) is self
-            if self._softmaxes.entries or self.outputs.entries or not here:
-                return
-            if height > base + 1:
-                above = [torch._C._pop_torch_function_stack() for _ in range(height - base - 1)]
-            torch._C._pop_torch_function_stack()
-        self._on = not self._on
-        for mode in reversed(above):
+            self._enter_stack()
+        return True
+
+    def end(self, module: nn.Module) -> None:
+        """Notice that a module ends for which `begin` gave True."""
+        number = id(module)
+        if number in self._paths:
+            self._running.pop()
+        if number not in self._quiet:
+            self._watched -= 1
+        if self._quiet and self._on and not self._watched:
+            self._leave_stack()
+
+    def _enter_stack(self) -> None:
+        """Go on the stack of function modes: under what the policy put there, and above torch's own default device."""
+        height, place = torch._C._len_torch_function_stack(), 0
+        while place < height and self._stays_below(torch._C._get_function_stack_at(place)):
+            place += 1
+        above = [torch._C._pop_torch_function_stack() for _ in range(height - place)]
+        for mode in (self, *reversed(above)):
             torch._C._push_on_torch_function_stack(mode)
+        self._on = True
+
+    def _stays_below(self, mode: object) -> bool:
+        return isinstance(mode, DeviceContext) or any(mode is one for one in self._before)
+
+    def _leave_stack(self) -> None:
+        """Go off it again, unless something is followed, or torch itself took this mode off to ask it about a function.
+
+        In such a function modules may run.
+        """
+        if self._softmaxes.entries or self.outputs.entries:
+            return
+        height = torch._C._len_torch_function_stack()
+        for place in range(height - 1, -1, -1):
+            if torch._C._get_function_stack_at(place) is self:
+                above = [torch._C._pop_torch_function_stack() for _ in range(height - place)][:-1]
+                for mode in reversed(above):
+                    torch._C._push_on_torch_function_stack(mode)
+                self._on = False
+                return
 
     @contextmanager
     def watching(self) -> Iterator[None]:
         """Be on in the block, throughout or where attention is."""
-        self._base = torch._C._len_torch_function_stack()
-        if 0 not in self._quiet:
-            self._switch()
+        self._before = [torch._C._get_function_stack_at(place) for place in range(torch._C._len_torch_function_stack())]
+        if not self._quiet:
+            self._enter_stack()
         _NOTICING.mode = self
         try:
             yield
@@ -328,8 +356,7 @@ class AttentionMode(TorchFunctionMode):
             _NOTICING.mode = None
             self._softmaxes.entries.clear()
             self.outputs.entries.clear()
-            if self._on:
-                self._switch()
+            self._leave_stack()
 
     @property
     def changes(self) -> bool:
@@ -339,28 +366,28 @@ class AttentionMode(TorchFunctionMode):
     def known(self, key: tuple[Any, ...]) -> Any:
         """Return what was the same for all calls of one kind in blocks that were watched throughout; None in those.
 
-        key: what is known, the place, and what tells calls apart behind it.
+        key: what is known, the module's path, and what tells calls apart in it.
         """
         return None if self.whole else self._places.facts.get((*key, self._multihead_heads))
 
     def learn(self, key: tuple[Any, ...], facts: Any) -> None:
         """Keep what is known of calls of one kind, key as in `known`; facts: None if it is not the same for all."""
-        if self.whole and key[1] is not None:
+        if self.whole:
             self._places.learn((*key, self._multihead_heads), facts)
 
-    def facts(self, kind: tuple[Any, ...], find_out: Callable[[], tuple[CallShape, _Fact]]) -> tuple[CallShape, _Fact]:
+    def shape_of(
+        self, kind: tuple[Any, ...], find_out: Callable[[], tuple[CallShape, _Fact]]
+    ) -> tuple[CallShape, _Fact]:
         """Return the shape of the call that comes next, and something else that is the same for all such calls.
 
-        kind: what tells calls apart behind a place. find_out: is asked where this is not known: who computes attention
-        stands in Python's frames, which are slow to read.
+        kind: the module's path, and what tells calls apart in it. find_out: is asked once for each kind.
         """
-        key = ("shape", self.place, *kind)
-        known = self.known(key)
-        if known is None:
+        key = ("shape", *kind, self._multihead_heads)
+        if key not in self._places.facts:
             shape, fact = find_out()
-            self.learn(key, (structs.replace(shape, number=0), fact))
+            self._places.facts[key] = structs.replace(shape, number=0), fact
             return shape, fact
-        shape, fact = known
+        shape, fact = self._places.facts[key]
         return structs.replace(shape, number=self.number), fact
 
     def close(self) -> None:
@@ -380,8 +407,18 @@ class AttentionMode(TorchFunctionMode):
                 "it. Open the block in the thread that calls the policy, around that one call, and let no other thread "
                 "call it meanwhile."
             )
-        self._places.passed(self._passed, self._attending)
-        self._watcher.modules = {place for place in self._passed | self._places.seen if place > 0}
+        self._softmaxes.learn_unmet()
+        missed = self._places.missed
+        found = self._places.passed(self._ran, self._attending, whole=self.whole, number=self.number)
+        self._watcher.modules = self._ran | self._places.seen
+        if found:
+            paths = listing(sorted(self._paths[number] for number in found))
+            warnings.warn(
+                f"The policy computes attention in {paths} now, where it had none in the first policy calls. In "
+                f"{plural(missed, 'block')} before this one no attention was seen, which may have been there, and "
+                "nothing of them was recorded.",
+                Note,
+            )
 
 
 @contextmanager
@@ -439,14 +476,14 @@ def noticing_modules() -> Iterator[None]:
     if not _NOTICING.blocks:
         plain = _NOTICING.plain = nn.Module.__call__
 
-        def noticed(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
+        def noticed(module: nn.Module, /, *args: Any, **kwargs: Any) -> Any:
             mode = _NOTICING.mode
-            if mode is None:
+            if mode is None or not mode.begin(module):
                 return plain(module, *args, **kwargs)
-            mode.pass_by(module, id(module))
-            result = plain(module, *args, **kwargs)
-            mode.pass_by(module, -id(module))
-            return result
+            try:
+                return plain(module, *args, **kwargs)
+            finally:
+                mode.end(module)
 
         nn.Module.__call__ = _NOTICING.noticed = noticed  # type: ignore[method-assign]
     _NOTICING.blocks += 1

@@ -15,6 +15,7 @@ from tests.kit.examples import examples
 from tests.kit.stores import StoreSpec, denoise_times, episode_records, root_attributes
 from vla_attention.capture.store import codecs, site_writer
 from vla_attention.capture.store.codecs import write_whole
+from vla_attention.capture.store.episode_writer import StoreWriteFailed
 from vla_attention.capture.store.growing_arrays import GrowingArray, SpilledArrays
 from vla_attention.capture.store.store_writer import open_run
 
@@ -84,3 +85,46 @@ def test_memory_does_not_grow_with_replans(tmp_path, monkeypatch):
     of_replan = sum(rows.rows.nbytes for rows in records[0].rows.values())
     of_replan += sum(values.nbytes for values, _ in records[0].arrays.values())
     assert (held[3] - held[1]) / 100 < of_replan / 4  # facts, and where chunks are
+
+
+def test_an_episode_of_which_a_replan_failed_halfway_is_refused(tmp_path, monkeypatch):
+    start, records = episode_records(spec := StoreSpec(), 0, 0)
+    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new", durable=False)
+    append, calls = GrowingArray.append, []
+
+    def failing(array, values):
+        calls.append(values)
+        if len(calls) == 3:
+            raise OSError(28, "No space left on device")
+        append(array, values)
+
+    monkeypatch.setattr(GrowingArray, "append", failing)
+    with store.episode(start, denoise_times(spec)) as writer:
+        with pytest.raises(StoreWriteFailed, match="No space left"):
+            writer.append(records[0])
+        for add in (lambda: writer.append(records[0]), lambda: writer.commit(True, 15)):
+            with pytest.raises(StoreWriteFailed, match="not written wholly"):
+                add()
+    assert list((tmp_path / "a.zarr" / "episodes").glob("task*")) == []
+
+
+@pytest.mark.parametrize("committed", [True, False])
+def test_what_waits_on_the_disk_is_given_back(tmp_path, monkeypatch, committed):
+    monkeypatch.setattr(site_writer, "_MOST_WAITING", 0)
+    monkeypatch.setattr(site_writer, "_MOST_BESIDE", 0)
+    opened = []
+
+    def kept(*args):
+        opened.append(SpilledArrays(*args))
+        return opened[-1]
+
+    monkeypatch.setattr(site_writer, "SpilledArrays", kept)
+    start, records = episode_records(spec := StoreSpec(), 0, 0)
+    store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new", durable=False)
+    with store.episode(start, denoise_times(spec)) as writer:
+        for record in records:
+            writer.append(record)
+        if committed:
+            writer.commit(True, 15)
+    assert len(opened) == 3
+    assert all(one._file.closed for one in opened)

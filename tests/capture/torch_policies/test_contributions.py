@@ -400,3 +400,18 @@ def test_what_is_done_to_the_output_by_code_that_is_not_seen_is_noticed(tmp_path
         policy = ResidualPolicy(add)
         with pytest.raises(ContributionsUnknown):
             recorded(tmp_path / str(number), policy)
+
+
+@pytest.mark.parametrize(("dtype", "bias"), [(torch.float32, 300), (torch.bfloat16, 10)])
+def test_a_large_bias_hides_no_other_order_of_the_heads(tmp_path, dtype, bias):
+    def turned(mixed: Tensor) -> Tensor:
+        return mixed.view(*mixed.shape[:2], HEADS, DIM).transpose(2, 3).reshape(mixed.shape)
+
+    policy = ResidualPolicy(lambda block, call: call.stream + block.out(turned(call.mixed)))
+    way = Way(policy.blocks[0].add, lambda block, call, share: projected(block, turned(share)))
+    for block in policy.blocks:
+        block.out.bias.data.fill_(bias)
+    policy = policy.to(dtype)
+    wanted = expected(policy, way)
+    for gram in recorded(tmp_path, policy).episodes[0].read("joint/contribution"):
+        close(gram, wanted, most=1e-3 if dtype is torch.float32 else 3e-2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 
 import numpy as np
 import pytest
@@ -10,15 +11,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention as sdpa
 from torch.overrides import TorchFunctionMode
+from torch.utils._device import DeviceContext
 
+import vla_attention as va
 from tests.capture.torch_policies.test_session import fill, start, stored
-from tests.kit.attention_modules import Policy, Seen
+from tests.kit.attention_modules import Policy, Seen, first_and_narrow
 from tests.kit.small_torch_policy import SmallPolicy, given
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.torch_policies.attention_calls import Watcher
 from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.watch import AttentionMode, NotFollowed, watch_attention
 from vla_attention.capture.torch_policies.watched_places import EVERY, WatchedPlaces
+from vla_attention.schemas.errors import Note
+from vla_attention.schemas.layout import SiteLayout, Span
+from vla_attention.schemas.stores.reader import open_store
 
 
 class OwnMode(TorchFunctionMode):
@@ -28,34 +35,37 @@ class OwnMode(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
+class Attend(nn.Module):
+    """Attention where `on` is set."""
+
+    def __init__(self, on: bool = True) -> None:
+        super().__init__()
+        self.on = on
+
+    def forward(self, x: Tensor) -> Tensor:
+        heads = x.view(1, -1, 2, 4).transpose(1, 2)
+        return sdpa(heads, heads, heads).transpose(1, 2).flatten(2) if self.on else x
+
+
 class Steps(nn.Module):
-    """Attention in `attend`, called by `forward` between `before` and `after`; `changed` says what a call does else."""
+    """Attention in a module between others; `changed` says what a call does else."""
 
     def __init__(self) -> None:
         super().__init__()
         torch.manual_seed(0)
-        self.before, self.after, self.late = nn.Linear(8, 8), nn.Linear(8, 8), nn.Linear(8, 8)
-        self.changed = ""
+        self.before, self.attend, self.after = nn.Linear(8, 8), Attend(), Attend(on=False)
+        self.late, self.changed = Attend(), ""
 
-    def attend(self, x: Tensor) -> Tensor:
-        x = x.view(1, -1, 2, 4).transpose(1, 2)
-        return sdpa(x, x, x).transpose(1, 2).flatten(2)
-
+    @torch.no_grad()
     def forward(self, x: Tensor) -> Tensor:
-        with torch.no_grad():
-            if self.changed == "earlier":
-                x = self.attend(x)
-            x = self.before(x)
-            if self.changed == "in a mode":
-                with OwnMode():
-                    x = self.before(x)
-                    x = self.attend(x)
-            else:
-                x = self.attend(x)
-            x = self.after(x).relu().sin().cos()
-            if self.changed == "after":
-                x = self.attend(x)
-            return self.attend(self.late(x)) if self.changed == "in another module" else x
+        x = self.before(x)
+        with OwnMode() if self.changed == "in a mode" else nullcontext():
+            if self.changed == "failing":
+                with suppress(RuntimeError):
+                    self.attend(x[0, 0, 0])
+            x = self.attend(x)
+        x = self.after(x).relu().sin().cos()
+        return self.late(x) if self.changed == "in another module" else x
 
 
 @pytest.fixture
@@ -77,7 +87,7 @@ def calls_of(policy, found, changed=""):
 
 def test_functions_elsewhere_do_not_pass_through_python(steps, monkeypatch):
     policy, found = steps
-    passed = []
+    passed, names = [], []
     inside = AttentionMode.__torch_function__
 
     def counted(self, func, types, args=(), kwargs=None):
@@ -85,7 +95,6 @@ def test_functions_elsewhere_do_not_pass_through_python(steps, monkeypatch):
         return inside(self, func, types, args, kwargs)
 
     monkeypatch.setattr(AttentionMode, "__torch_function__", counted)
-    names = []
     for _ in range(4):
         passed.clear()
         assert len(calls_of(policy, found).rows) == 1
@@ -95,22 +104,22 @@ def test_functions_elsewhere_do_not_pass_through_python(steps, monkeypatch):
     assert "scaled_dot_product_attention" in names[3]
 
 
-@pytest.mark.parametrize("changed", ["in another module", "in a mode"])
-def test_what_is_new_is_seen_at_once(steps, changed):
+@pytest.mark.parametrize(("changed", "count"), [("in another module", 2), ("in a mode", 1), ("failing", 1)])
+def test_what_is_new_is_seen_at_once(steps, changed, count):
     policy, found = steps
     for _ in range(3):
         calls_of(policy, found)
     seen = calls_of(policy, found, changed)
     assert not seen.whole
-    assert len(seen.rows) == (2 if changed == "in another module" else 1)
+    assert len(seen.rows) == count
 
 
-@pytest.mark.parametrize("changed", ["earlier", "after"])
-def test_attention_behind_places_that_had_none_is_seen_after_some_calls(steps, changed):
+def test_a_module_that_begins_to_compute_attention_is_seen_after_some_calls(steps):
     policy, found = steps
     for _ in range(3):
         calls_of(policy, found)
-    numbers = [len(calls_of(policy, found, changed).rows) for _ in range(EVERY)]
+    policy.after.on = True
+    numbers = [len(calls_of(policy, found).rows) for _ in range(EVERY)]
     assert numbers[0] == 1
     first = numbers.index(2)
     assert first <= EVERY - 3
@@ -118,21 +127,197 @@ def test_attention_behind_places_that_had_none_is_seen_after_some_calls(steps, c
     assert set(numbers[first:]) == {2}
 
 
-def test_calls_without_attention_teach_nothing():
+def test_attention_that_moved_is_missed_once_and_that_is_said(steps):
+    policy, found = steps
+    for _ in range(3):
+        calls_of(policy, found)
+    policy.attend.on, policy.after.on = False, True
+    assert calls_of(policy, found).rows == []
+    with pytest.warns(Note, match=r"computes attention in after now.*1 block before"):
+        assert len(calls_of(policy, found).rows) == 1
+    for _ in range(3):
+        assert len(calls_of(policy, found).rows) == 1
+
+
+def test_answers_from_a_queue_teach_nothing():
     places = WatchedPlaces()
     for _ in range(10):
-        places.passed({0, 1}, set())
-    assert places.next_is_whole()
+        assert places.next_is_whole()
+        places.passed({7, 8}, set(), whole=True, number=0)
+    for call in range(20):
+        whole = places.next_is_whole()
+        places.passed({7, 8, 9}, {9}, whole=whole, number=1)
+        for _ in range(4):
+            whole = places.next_is_whole()
+            places.passed({7}, {7}, whole=whole, number=0)  # a gate's softmax
+            assert whole is (call < 2 or call % EVERY == EVERY - 1)
+    assert places.calls == 20
+
+
+def test_a_new_module_begins_anew():
+    places, found = WatchedPlaces(), []
+    for call in range(12):
+        whole = places.next_is_whole()
+        found.append(whole)
+        places.passed({1, 2}, {1} if call < 5 or not whole else {1, 2}, whole=whole, number=1)
+    assert found == [True] * 3 + [False] * 9
+    places = WatchedPlaces()
+    for call in range(4):
+        places.passed({1, 2}, {1, 2} if call else {1}, whole=places.next_is_whole(), number=1)
     assert places.quiet == set()
 
 
-def test_a_new_place_begins_anew():
-    places = WatchedPlaces()
-    whole = []
-    for call in range(12):
-        whole.append(places.next_is_whole())
-        places.passed({0, 1, 2}, {1} if call < 5 else {1, 2})
-    assert whole == [True] * 3 + [False] * 3 + [True] * 2 + [False] * 4
+class Cached(nn.Module):
+    """Projects the instruction when it changes, and answers five calls from one chunk, with a softmax of its own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.words, self.tokens = nn.Embedding(9, 16), nn.Parameter(torch.randn(1, 5, 16))
+        self.q, self.k, self.v, self.out = nn.Linear(16, 16), nn.Linear(16, 16), nn.Linear(16, 16), nn.Linear(16, 2)
+        self.text, self.queue = None, []
+
+    @torch.no_grad()
+    def forward(self, ids: Tensor) -> Tensor:
+        if not self.queue:
+            heads = [self.q(self.tokens).view(1, -1, 2, 8).transpose(1, 2)]
+            if self.text is None or not torch.equal(self.text, ids):
+                words = self.words(ids)
+                self.text, self.kv = ids, [f(words).view(1, -1, 2, 8).transpose(1, 2) for f in (self.k, self.v)]
+            mixed = sdpa(*heads, *self.kv).transpose(1, 2).flatten(2)
+            self.queue = list(self.out(self.tokens + mixed)[0])
+        action = self.queue.pop(0)
+        return torch.cat([action[:1], action[1:].softmax(-1)])
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_every_call_of_a_policy_with_queue_and_cache_is_recorded_and_changed(tmp_path, hidden):
+    policy = Cached().eval()
+    keys = SiteLayout("text", (Span("prompt", "text", 0, 2), Span("state", "state", 2, 4)))
+    site = va.RecordedSite(keys, (0, 5), {"prompt": "text", "state": "state"})
+    layout = va.PolicyLayout(
+        "tiny", "tiny", (site,), (va.CallRule(".*", None, sequence=(("text", 0),)),), 1, 2, 1, denoise_times=(1.0,)
+    )
+    changes = {"interventions": va.knockout("role:state")} if hidden else {}
+    run = va.record(tmp_path / "a.zarr", policy, layout=layout, contributions=False, durable=False, **changes)
+    actions = []
+    with run, run.episode(task_id=0, episode_index=0, instruction="a") as episode:
+        for step in range(40):
+            with episode.replan(env_step=step) as replan:
+                replan.actions = policy(torch.tensor([[1, 2, 3, 4]]))
+            actions.append(replan.actions[0].item())
+    assert episode.num_replans == 8
+    assert len({*actions[::5]}) == 1  # the same call, changed or not
+    rows = open_store(tmp_path / "a.zarr").episodes[0].read("text/rows")
+    assert (rows[..., 2:] > 0).any() is np.bool_(not hidden)
+
+
+class Trunk(nn.Module):
+    """Computes attention in methods of two modules that it does not call, behind the same layer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trunk, self.arm, self.hand = nn.Linear(8, 8), Attending(), Attending()
+
+    def forward(self, x: Tensor, name: str) -> Tensor:
+        return getattr(self, name).attend(self.trunk(x))
+
+
+class Attending(nn.Module):
+    def attend(self, x: Tensor) -> Tensor:
+        return sdpa(x, x, x)
+
+
+def test_who_computes_attention_is_asked_at_every_call():
+    policy = Trunk()
+    found = find_policy(policy)
+    for name in ("arm", "arm", "arm", "hand", "arm"):
+        seen = Seen()
+        with torch.no_grad(), watch_attention(found, seen):
+            policy(torch.ones(1, 2, 3, 8), name)
+        assert [shape.module for shape in seen.shapes] == [name]
+
+
+def test_a_default_device_that_the_policy_sets_stays_and_nothing_else(steps):
+    policy, found = steps
+    seen = Seen()
+    try:
+        for _ in range(5):
+            with watch_attention(found, seen):
+                policy(torch.ones(1, 3, 8))
+                torch.set_default_device("cpu")
+                policy(torch.ones(1, 3, 8))
+            modes = torch._C._len_torch_function_stack()
+            assert [type(torch._C._get_function_stack_at(place)) for place in range(modes)] == [DeviceContext]
+    finally:
+        torch.set_default_device(None)
+    assert torch._C._len_torch_function_stack() == 0
+
+
+class ByHand(nn.Module):
+    """Two layers of attention by hand; what `logits` makes of a layer's logits."""
+
+    def __init__(self, logits, beside=None) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.p, self.logits, self.beside = nn.Linear(4, 4), logits, beside
+
+    @torch.no_grad()
+    def forward(self, x: Tensor) -> Tensor:
+        for layer in range(2):
+            x = self.p(x)
+            logits = self.logits(x @ x.mT, layer)
+            if self.beside is not None:
+                self.beside(logits)
+            x = logits.softmax(-1) @ x
+        return x
+
+
+def test_keys_that_one_head_does_not_see_are_not_taken_for_those_of_the_layer_before():
+    def hidden(logits, layer):
+        if layer:
+            logits[:, 0, :, 2] = float("-inf")
+        return logits
+
+    for seen, _ in first_and_narrow(policy := ByHand(hidden), lambda: policy(torch.ones(1, 2, 3, 4))):
+        assert seen.allowed[1][0, 0, 0].tolist() == [True, True, False]
+
+
+class Counting(Watcher):
+    """Takes nothing, and counts the attention calls."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def passes(self, shape) -> bool:
+        self.calls.append(str(shape))
+        return True
+
+
+def test_a_softmax_beside_the_attention_is_not_counted_for_one():
+    policy = ByHand(lambda logits, layer: logits, lambda logits: (logits.softmax(-1) * logits.log_softmax(-1)).sum(-1))
+    found = find_policy(policy)
+    for _ in range(5):
+        counting = Counting()
+        with watch_attention(found, counting):
+            policy(torch.ones(1, 2, 3, 4))
+        assert len(counting.calls) == 2
+
+
+def test_a_mask_that_is_written_over_after_the_kernel_ran():
+    def forward(x):
+        for _ in range(2):
+            mask = torch.zeros(3, 3)
+            mask[:, 0] = -1e9
+            x = sdpa(x, x, x, attn_mask=mask)
+            mask.zero_()
+        return x
+
+    policy = nn.Identity()
+    policy.forward = forward
+    for seen, _ in first_and_narrow(policy, lambda: policy(torch.randn(1, 2, 3, 4))):
+        assert max(float(rows[..., 0].max()) for rows in seen.rows) == 0
+        assert max(seen.errors) < 1e-5
 
 
 def test_rows_and_contributions_are_those_of_calls_that_are_watched_throughout(tmp_path, monkeypatch):
