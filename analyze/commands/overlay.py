@@ -42,7 +42,7 @@ _PLACES = (("top", "middle", "bottom"), ("left", "centre", "right"))
 _COLUMNS = (
     Column("task_id", "count", "task"),
     Column("episode_index", "count", "episode"),
-    Column("env_step", "count", "step"),
+    Column("step", "count", meaning="actions executed before the call, after the waiting steps"),
     Column("camera", "text"),
     Column("share", "percent", "of image attention"),
     Column("lift", "factor", "highest", "times the attention that the patch would get if it were spread evenly"),
@@ -144,7 +144,7 @@ def _chosen_replans(maps: EpisodeMaps, wanted: Sequence[int] | None, most: int) 
     return tuple(int(i) for i in np.unique(np.linspace(0, count - 1, min(most, count)).round()))
 
 
-_KEPT = (*EPISODE_ID, "replan", "env_step", "camera", "share", "lift", "place", "object", "ratio")
+_KEPT = (*EPISODE_ID, "replan", "env_step", "step", "camera", "share", "lift", "place", "object", "ratio")
 
 
 def _frame(
@@ -154,6 +154,7 @@ def _frame(
     item, identity = maps.item, dict(zip(EPISODE_ID, maps.item.key, strict=True))
     known = {} if ratios is None else dict(ratios.filter(**identity).select("replan", "ratio").iter_rows())
     taken = None if groups is None else resolve(groups, item.tokens).weights >= _OUTLINE_WEIGHT
+    starts, _ = item.timing(maps.env_step)
     rows = []
     for camera, one in maps.cameras.items():
         covering = (item.tokens.coverage or {}).get(camera)
@@ -163,11 +164,12 @@ def _frame(
             row, column = np.unravel_index(int(np.nan_to_num(lift).argmax()), lift.shape)
             share = float((one.mass[replan].sum() + one.outside[replan]) / max(maps.image_mass[replan], _TINY))
             ratio = known.get(replan)
-            step = int(maps.env_step[replan])
+            step = int(starts[replan])
             place = _place(int(row), int(column), lift.shape)
             cells = None if members is None else one.picture.highest(members[min(replan, len(members) - 1)])
             rows.append({
-                **identity, "replan": replan, "env_step": step, "camera": camera, "row": camera, "column": replan,
+                **identity, "replan": replan, "env_step": int(maps.env_step[replan]), "step": step, "camera": camera,
+                "row": camera, "column": replan,
                 "above": f"step {step}" + ("" if ratio is None else f", ratio {ratio:.3g}"),
                 "below": f"{share:.0%} of image attention\nhighest {float(f'{lift[row, column]:.2g}'):g}, {place}",
                 "map": lift.tolist(), "share": share, "lift": float(lift[row, column]), "place": place,
@@ -240,9 +242,9 @@ def _finding(question: Question, maps: EpisodeMaps, table: pl.DataFrame) -> Find
     on = "" if row["object"] is None else f", on the {row['object'].replace('_', ' ')}"
     said = (
         f"In {_named(maps)}, most attention for its size goes to a patch at the {row['place']} of {row['camera']}{on}: "
-        f"{row['lift']:.2g} times what evenly spread attention would give it (step {row['env_step']})."
+        f"{row['lift']:.2g} times what evenly spread attention would give it (step {row['step']})."
     )
-    numbers = {name: row[name] for name in ("lift", "share", "camera", "replan", "env_step", "place", "object")}
+    numbers = {name: row[name] for name in ("lift", "share", "camera", "replan", "env_step", "step", "place", "object")}
     limit, store = "This is one patch of one policy call; over all episodes:", question.stores[0].path
     over_all = f"analyze {store} --by camera" if row["object"] is None else f"objects {store}"
     return Finding(said, "Where does it look?", numbers, limit, f"vla-attention {over_all}")

@@ -137,6 +137,18 @@ def test_maps_of_the_page_are_those_of_overlay(server, places, name):
                 np.testing.assert_array_equal(shown, picture)
 
 
+def test_page_and_overlay_have_one_clock(server, places):
+    """Steps after the waiting steps, which `env_step` counts too."""
+    about = read(server, "joint", "about.json")
+    result = va.open(places["joint"]).overlay(tasks=0, episode=0, replans=[0, 2])
+    steps = {replan: start for replan, start in enumerate(about["starts"]) if replan in (0, 2)}
+    assert steps[0] == 0
+    assert dict(result["overlay"].select("replan", "step").iter_rows()) == steps
+    assert set(result["overlay"]["env_step"]) == {about["env_step"][replan] for replan in steps}
+    above = result.figures[0].frame.select("replan", "above").iter_rows()
+    assert all(text.startswith(f"step {steps[replan]}") for replan, text in above)
+
+
 def test_the_film_has_every_call(server):
     about = read(server, "joint", "about.json")
     reply = ask(server, f"runs/0/{about['name']}/film.gif")

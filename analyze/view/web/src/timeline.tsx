@@ -109,7 +109,7 @@ export function Timeline() {
           playing.value = !playing.value;
         }}>{playing.value ? "❚❚" : "▶"}</button>
         <input type="range" aria-label="Replan" min="0" max={last} value={replan.value} onInput={(event) => setPart({ replan: event.currentTarget.value })} />
-        <output>step {episode.starts[replan.value]} of {episode.end}, call {replan.value + 1} of {last + 1}</output>
+        <output>step {episode.starts[replan.value]} of {episode.end}, call {replan.value} of 0 to {last}</output>
       </div>
       <ol class="events">
         {events.value.map((event) => (
