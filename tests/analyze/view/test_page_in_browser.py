@@ -268,3 +268,43 @@ def test_copies_show_the_same_from_a_folder_below_a_path_and_from_disk(browser, 
         selector = watched.page.locator('[aria-label="Selector"]')
         assert selector.is_disabled()
         assert "vla-attention view" in selector.get_attribute("placeholder")
+
+
+def test_a_walk_by_keyboard_comes_back_to_its_card(view, server):
+    page = view.page
+    view.open(server.link)
+    assert page.title() == "run.zarr · Attention"
+    page.locator("button.card").nth(1).focus()
+    page.keyboard.press("Enter")
+    view.wait_for_link("episode=task000_episode001")
+    assert page.title() == "task 0, episode 1 · run.zarr · Attention"
+    seen = set()
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        seen.add(page.evaluate("document.activeElement.tagName"))
+    assert {"BUTTON", "svg", "SELECT"} <= seen
+    page.keyboard.press("Escape")
+    view.settle()
+    page.wait_for_function("document.activeElement.dataset.episode === 'task000_episode001'")
+
+
+@pytest.mark.parametrize(
+    "part", ["curve=constructor", "site=nowhere", "layer=constructor&head=-3&denoise=x", "replan=1e9"]
+)
+def test_links_that_name_what_is_not_there_show_what_is(view, server, part):
+    view.open(f"{server.link}{FIRST}&{part}")
+    assert view.page.locator(".timeline .plot").count() == 1
+    said = view.page.locator(".banner").all_inner_texts()
+    assert said == (["The run has no site 'nowhere': 'joint' is shown."] if "site" in part else [])
+
+
+def test_a_server_that_ended_is_a_banner(browser, server):
+    with watched_page(browser) as view:
+        view.open(f"{server.link}{FIRST}")
+        view.page.context.set_offline(True)
+        view.page.keyboard.press("]")
+        view.page.wait_for_selector('.banner[role="alert"]')
+        assert "Start it again" in view.page.inner_text('.banner[role="alert"]')
+        view.page.context.set_offline(False)
+        view.page.keyboard.press("]")
+        view.page.wait_for_selector('.banner[role="alert"]', state="detached")

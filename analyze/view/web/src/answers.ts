@@ -1,4 +1,5 @@
 /** What the server answers (analyze/view/answers.py has the addresses), as types, and how it is asked. */
+import { signal } from "@preact/signals";
 
 export type Grid = (number | null)[][];
 export type Outcome = boolean | null;
@@ -212,10 +213,24 @@ function inside(address: string): Uint8Array<ArrayBuffer> {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
+/** Whether the last question found nobody who answers. */
+export const serverGone = signal(false);
+
+async function answerTo(address: string): Promise<Response> {
+  try {
+    const reply = await fetch(address);
+    serverGone.value = false;
+    return reply;
+  } catch {
+    serverGone.value = true;
+    throw new Error(isFolder ? `Nobody answers for ${address}.` : "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.");
+  }
+}
+
 async function bytesOf(address: string): Promise<ArrayBuffer> {
   if (within) return unpacked(inside(address));
   if (isFolder && address.includes("?")) throw new Error(NEEDS_SERVER);
-  const reply = await fetch(isFolder ? `${address}.gz` : address);
+  const reply = await answerTo(isFolder ? `${address}.gz` : address);
   if (reply.ok) return unpacked(new Uint8Array(await reply.arrayBuffer()));
   if (isFolder) throw new Error(NEEDS_SERVER);
   const said = (await reply.json().catch(() => null)) as { error?: string } | null;
@@ -256,7 +271,7 @@ export function readArray(address: string): Promise<NumberArray> {
 
 /** What the page can show. Of a folder it is the one file that is not compressed, and says so. */
 export async function readRuns(): Promise<Runs> {
-  const runs = within ? await readJson<Runs>("runs.json") : ((await (await fetch("runs.json")).json()) as Runs);
+  const runs = within ? await readJson<Runs>("runs.json") : ((await (await answerTo("runs.json")).json()) as Runs);
   isFolder = runs.copy !== undefined && !within;
   return runs;
 }

@@ -5,9 +5,20 @@ import { render } from "preact";
 import "./page.css";
 import { EpisodePage } from "./episode";
 import { Overview } from "./overview";
-import { axes, beside, closeEpisode, denoise, effects, episodeName, head, layer, main, numReplans, playing, replan, runs, setPart } from "./state";
+import { serverGone } from "./answers";
+import { axes, beside, closeEpisode, denoise, effects, episodeName, head, layer, main, mended, numReplans, playing, replan, run, runs, setPart } from "./state";
 
 function App() {
+  return (
+    <>
+      {serverGone.value ? <p class="banner" role="alert">Nobody answers: vla-attention view has ended. Start it again, and load this page anew.</p> : null}
+      {mended.value ? <p class="banner" role="status">{mended.value}</p> : null}
+      <Shown />
+    </>
+  );
+}
+
+function Shown() {
   if (runs.value.error) return <p class="error" role="alert">{runs.value.error}</p>;
   if (!runs.value.value) return <p class="soft">Reading …</p>;
   return episodeName.value ? <EpisodePage /> : <Overview />;
@@ -42,6 +53,18 @@ addEventListener("keydown", (event) => {
 
 const page = document.getElementById("page")!;
 render(<App />, page);
+effect(() => {
+  const line = run.value?.episodes.find(({ name }) => name === episodeName.value);
+  const shown = line ? `task ${line.task}, episode ${line.episode} · ${run.value!.name}` : run.value?.name;
+  document.title = shown ? `${shown} · Attention` : "Attention";
+});
+// Who walks by keyboard goes on at the beginning of an episode, and behind it at the card that it was opened from.
+let last = episodeName.peek();
+effect(() => {
+  const [now, before] = [episodeName.value, last];
+  last = now;
+  if (now !== before) requestAnimationFrame(() => (now ? page : (document.querySelector<HTMLElement>(`[data-episode="${CSS.escape(before)}"]`) ?? page)).focus());
+});
 // For who waits until all is drawn: taken back at once, given when the browser has drawn.
 const ready = computed(() => !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !effects.value.pending)));
 const mark = (): void => void (page.dataset.ready = ready.peek() ? "1" : "");

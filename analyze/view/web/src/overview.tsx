@@ -58,7 +58,7 @@ const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcom
 function Card({ line }: { line: EpisodeLine }) {
   const numbers = runNumbers.value?.episodes.find(({ name }) => name === line.name);
   return (
-    <button class={`card ${kindOf(line)}`} title={line.failed ?? line.verdict} onClick={() => openEpisode(line.name)}>
+    <button class={`card ${kindOf(line)}`} data-episode={line.name} title={line.failed ?? line.verdict} onClick={() => openEpisode(line.name)}>
       {line.picture ? (
         <img src={address.picture(runNumber.value, line.name, ...line.picture)} alt="" loading="lazy" />
       ) : (

@@ -93,7 +93,7 @@ function Picture(one: At) {
       <div class="stack" data-camera={camera}>
         {how.stored ? <img src={address.picture(scene.run.value, scene.name.value, camera, at)} alt={`${camera} at call ${at}`} width={how.width} height={how.height} /> : <div class="grey" />}
         <svg
-          viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" role="img" tabIndex={0} aria-label={`${camera}: arrow keys go from patch to patch, Enter picks one`}
+          viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" role="img" tabindex={0} aria-label={`${camera}: arrow keys go from patch to patch, Enter picks one`}
           onKeyDown={(event) => byKey(event)}
           onMouseMove={(event) => (pointed.value = { scene, camera, cell: cellAt(event, how) })}
           onMouseLeave={() => (pointed.value = null)}

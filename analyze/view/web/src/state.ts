@@ -112,7 +112,13 @@ effect(() => {
   return () => clearTimeout(timer);
 });
 
-export const site = computed(() => part("site") || run.value?.sites[0]?.name || "");
+/** The site that the link names; the first one where the run does not have it. */
+export const site = computed(() => {
+  const known = run.value?.sites.map(({ name }) => name) ?? [];
+  return !run.value || known.includes(part("site")) ? part("site") : (known[0] ?? "");
+});
+/** What the link names and the run does not have, in a sentence. */
+export const mended = computed(() => (run.value && part("site") && part("site") !== site.value ? `The run has no site '${part("site")}': '${site.value}' is shown.` : ""));
 export const axes = computed(() => run.value?.sites.find(({ name }) => name === site.value) ?? null);
 
 const choice = (name: "layer" | "head" | "denoise", known: () => readonly number[]): ReadonlySignal<Choice> =>

@@ -92,7 +92,8 @@ function Plot({ curves, title }: { curves: Curves; title: string }) {
 /** The same object until other numbers are drawn: a plot is made anew for each. */
 const drawn = computed(() => {
   const known = kinds();
-  const chosen = known[part("curve")] ? part("curve") : Object.keys(known)[0];
+  const names = Object.keys(known);
+  const chosen = names.includes(part("curve")) ? part("curve") : names[0];
   return { known, chosen, curves: chosen === undefined ? null : known[chosen]!.of() };
 });
 
