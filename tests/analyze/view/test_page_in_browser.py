@@ -308,3 +308,27 @@ def test_a_server_that_ended_is_a_banner(browser, server):
         view.page.context.set_offline(False)
         view.page.keyboard.press("]")
         view.page.wait_for_selector('.banner[role="alert"]', state="detached")
+
+
+def test_two_episodes_are_one_time_line_over_the_longer_one(browser, store, tmp_path):
+    longer = write_store(tmp_path / "longer.zarr", spec=replace(SPEC, replans=5, seed=3))
+    ends = [va.open(path).episodes["num_steps"][0] for path in (store, longer)]
+    starts = [[5 * replan for replan in range(count)] for count in (3, 5)]
+    with served(store, longer) as running, watched_page(browser) as view:
+        view.open(f"{running.link}{FIRST}&beside=1:task000_episode000")
+        for step in starts[1]:
+            said = view.page.inner_text(".scrub output")
+            calls = [sum(start <= step for start in of) - 1 for of in starts]
+            assert said.startswith(
+                f"step {step} of {max(ends)}, run.zarr, task 0, episode 0: call {calls[0]} of 0 to 2"
+            )
+            assert f"longer.zarr, task 0, episode 0: call {calls[1]} of 0 to 4" in said
+            assert (", ended" in said) is (step >= ends[0])
+            view.page.keyboard.press("ArrowRight")
+            view.settle()
+        curves = view.page.locator(".u-legend .u-series").all_inner_texts()
+        assert sum("longer.zarr" in one for one in curves) == sum("run.zarr" in one for one in curves) > 0
+        view.page.click("text=swap")
+        view.wait_for_link("run=1")
+        assert view.page.inner_text(".scrub output").startswith(f"step {starts[1][-1]} of {max(ends)}, longer.zarr")
+        assert view.complaints == []

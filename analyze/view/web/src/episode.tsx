@@ -10,7 +10,7 @@ import { kindOf } from "./overview";
 import { Legend, levels, Pictures } from "./pictures";
 import {
   about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameInRun, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, type Scene, setPart,
-  sides, site, step,
+  sides, site, step, swap,
 } from "./state";
 import { shown } from "./sums";
 import { Timeline } from "./timeline";
@@ -66,12 +66,15 @@ function ChooseBeside() {
   );
   known.sort((a, b) => Number(b.line.name === episode.name) - Number(a.line.name === episode.name));
   return known.length ? (
+    <>
     <label>compare with{" "}
       <select value={part("beside")} onChange={(event) => step({ beside: event.currentTarget.value })}>
         <option value="">nothing</option>
         {known.map(({ line, run: i, title }) => <option value={`${i}:${line.name}`}>{title}</option>)}
       </select>
     </label>
+    {part("beside") ? <button onClick={swap}>⇄ swap</button> : null}
+    </>
   ) : null;
 }
 
@@ -97,10 +100,11 @@ function SideBySide() {
         const episode = scene.about.value.value!;
         return (
           <div key={i}>
+            <h2>{nameOf(side)}</h2>
             <p class={`verdict ${kindOf(episode)}`}>{episode.verdict}</p>
             <Banners scene={scene} />
             <Pictures scene={scene} at={at} />
-            <p class="soft">{nameOf(side)}: step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
+            <p class="soft">step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
           </div>
         );
       })}

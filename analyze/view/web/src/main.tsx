@@ -6,7 +6,7 @@ import "./page.css";
 import { EpisodePage } from "./episode";
 import { Overview } from "./overview";
 import { serverGone } from "./answers";
-import { axes, beside, closeEpisode, denoise, effects, episodeName, head, layer, main, mended, numReplans, playing, replan, run, runs, setPart } from "./state";
+import { axes, beside, closeEpisode, denoise, effects, episodeName, head, layer, main, mended, playing, run, runs, setPart, walk } from "./state";
 
 function App() {
   return (
@@ -34,8 +34,8 @@ addEventListener("keydown", (event) => {
   const on = event.target as HTMLElement;
   if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea") || !episodeName.value) return;
   const acts: Record<string, () => void> = {
-    ArrowLeft: () => setPart({ replan: Math.max(0, replan.value - 1) }),
-    ArrowRight: () => setPart({ replan: Math.min(numReplans.value - 1, replan.value + 1) }),
+    ArrowLeft: () => walk(-1),
+    ArrowRight: () => walk(1),
     "[": () => setPart({ layer: next(axes.value?.layers, layer.value, -1) }),
     "]": () => setPart({ layer: next(axes.value?.layers, layer.value, 1) }),
     ",": () => setPart({ head: next(axes.value?.heads, head.value, -1) }),

@@ -37,7 +37,7 @@ export function answered<T>(ask: () => Promise<T> | null): ReadonlySignal<Answer
 /** The parts of the link, as texts; what is not in it has its default. */
 const DEFAULTS = {
   run: "0", episode: "", replan: "0", site: "", layer: "mean", head: "mean", denoise: "mean", words: "", beside: "", group: "",
-  without: "", find: "", task: "", show: "all", curve: "ratio",
+  without: "", find: "", task: "", show: "all", curve: "ratio", step: "",
 } as const;
 export type Part = keyof typeof DEFAULTS;
 
@@ -76,7 +76,7 @@ export function step(changes: Partial<Record<Part, string | number>>): void {
   setPart(changes);
 }
 
-const CLOSED = { episode: "", replan: 0, layer: "mean", head: "mean", denoise: "mean", group: "", without: "", beside: "" };
+const CLOSED = { episode: "", replan: 0, layer: "mean", head: "mean", denoise: "mean", group: "", without: "", beside: "", step: "" };
 
 /** Shows an episode from its beginning. */
 export function openEpisode(episode: string): void {
@@ -213,22 +213,55 @@ export const { about, layout, rows, groups, covered, masses } = main;
 export const massesAt = (at: number): Float64Array | null => massesOf(main, at);
 export const uniformAt = (at: number): Float64Array | null => evenOf(main, at);
 export const numReplans = computed(() => about.value.value?.starts.length ?? 0);
-export const replan = computed(() => Math.max(0, Math.min(Math.trunc(Number(part("replan"))) || 0, numReplans.value - 1)));
+
+/** The episode beside it, in the link as RUN:EPISODE. */
+const besideParts = computed(() => part("beside").split(":"));
+export const beside = sceneOf(computed(() => Number(besideParts.value[0]) || 0), computed(() => besideParts.value[1] ?? ""));
+
+const startsOf = (scene: Scene): readonly number[] => scene.about.value.value?.starts ?? [];
+/** The place of the last start that is not after a step. */
+const placeAt = (starts: readonly number[], step: number): number => Math.max(0, starts.filter((start) => start <= step).length - 1);
+
+/** The steps at which a policy call begins; of two episodes those of both, so that the longer one is seen to its end. */
+export const moments = computed(() => {
+  const other = part("beside") ? startsOf(beside) : [];
+  return other.length ? [...new Set([...startsOf(main), ...other])].sort((a, b) => a - b) : startsOf(main);
+});
+/** The step that is shown: of the main episode's call; where two are shown, the link names the step itself. */
+export const moment = computed(() => {
+  const [all, starts, given] = [moments.value, startsOf(main), part("step")];
+  if (part("beside") && given !== "") return all[placeAt(all, Number(given) || 0)] ?? 0;
+  return starts[Math.max(0, Math.min(Math.trunc(Number(part("replan"))) || 0, starts.length - 1))] ?? 0;
+});
+export const replan = computed(() => placeAt(startsOf(main), moment.value));
+export const besideReplan = computed(() => placeAt(startsOf(beside), moment.value));
+/** The last step of what is shown. */
+export const end = computed(() => Math.max(about.value.value?.end ?? 0, part("beside") ? (beside.about.value.value?.end ?? 0) : 0));
+
+/** Shows what was there at a step. */
+export function goTo(step: number): void {
+  const at = moments.peek()[placeAt(moments.peek(), step)] ?? 0;
+  setPart({ replan: placeAt(startsOf(main), at), step: part("beside") ? at : "" });
+}
+
+/** Goes so many calls on. */
+export function walk(by: number): void {
+  const all = moments.peek();
+  goTo(all[Math.max(0, Math.min(placeAt(all, moment.peek()) + by, all.length - 1))] ?? 0);
+}
+
+/** Puts each of two episodes in the other's place. */
+export function swap(): void {
+  const [ofRun, name] = besideParts.value;
+  step({ run: ofRun!, episode: name!, beside: `${runNumber.value}:${episodeName.value}`, step: moment.value });
+}
 
 // What a link names and does not exist is put right in the link, too.
 effect(() => {
   if (numReplans.value && part("replan") !== String(replan.value)) setPart({ replan: replan.value });
+  if (part("step") !== "" && (!part("beside") || (numReplans.value && !about.value.pending && !beside.about.value.pending && part("step") !== String(moment.value)))) setPart({ step: part("beside") ? moment.value : "" });
   if (axes.value) for (const [name, known] of [["layer", layer], ["head", head], ["denoise", denoise]] as const) if (part(name) !== String(known.value)) setPart({ [name]: known.value });
   if (runs.value.value && part("run") !== String(runNumber.value)) setPart({ run: runNumber.value });
-});
-
-/** The episode beside it, in the link as RUN:EPISODE; shown at the call whose step is nearest. */
-const besideParts = computed(() => part("beside").split(":"));
-export const beside = sceneOf(computed(() => Number(besideParts.value[0]) || 0), computed(() => besideParts.value[1] ?? ""));
-export const besideReplan = computed(() => {
-  const step = about.value.value?.starts[replan.value] ?? 0;
-  const starts = beside.about.value.value?.starts ?? [];
-  return starts.reduce((best, start, i) => (Math.abs(start - step) < Math.abs(starts[best]! - step) ? i : best), 0);
 });
 
 export const effects = answered<Effects | null>(() => (about.value.value?.effects ? readJson<Effects | null>(`${address.episode(runNumber.value, episodeName.value)}/effects.json`) : null));
@@ -243,11 +276,10 @@ export const sides = computed<readonly Side[]>(() => [{ scene: main, at: replan.
 /** In an exchange an episode is known by what it was told, and where. */
 export const nameInRun = (line: EpisodeLine): string => (line.scene == null ? `episode ${line.episode}` : `told '${line.told}', scene ${line.scene}`);
 
-/** As "told.zarr, episode 3"; empty where one episode is shown alone. */
+/** As "told.zarr, task 1, episode 3"; empty where one episode is shown alone. */
 export function nameOf({ scene }: Side): string {
-  const other = scene.run.value === runNumber.value ? "" : `${runs.value.value?.runs[scene.run.value]?.name}, `;
   const line = scene.about.value.value;
-  return sides.value.length > 1 && line ? `${other}${nameInRun(line)}` : "";
+  return sides.value.length > 1 && line ? `${runs.value.value?.runs[scene.run.value]?.name}, task ${line.task}, ${nameInRun(line)}` : "";
 }
 
 export function wordsOf({ scene, at }: Side): readonly Word[] {
@@ -256,16 +288,15 @@ export function wordsOf({ scene, at }: Side): readonly Word[] {
 }
 export const words = computed(() => wordsOf({ scene: main, at: replan.value }));
 
-/** Events with the leaving of solved episodes, which is computed from all of them. */
-export const events = computed<readonly EpisodeEvent[]>(() => {
-  const episode = about.value.value;
+/** Events of an episode, with the leaving of solved episodes, which is computed from all of its run. */
+export function eventsOf(scene: Scene): readonly EpisodeEvent[] {
+  const episode = scene.about.value.value;
   if (!episode) return [];
-  const leaves = runNumbers.value?.leaves?.[episode.name];
+  const leaves = scene.run.value === runNumber.value ? runNumbers.value?.leaves?.[episode.name] : undefined;
   if (leaves === undefined) return episode.events;
-  const before = episode.starts.filter((start) => start <= leaves).length - 1;
-  const own: EpisodeEvent = { step: leaves, replan: Math.max(0, before), kind: "leaves", text: "leaves the solved episodes", thing: "" };
+  const own: EpisodeEvent = { step: leaves, replan: placeAt(episode.starts, leaves), kind: "leaves", text: "leaves the solved episodes", thing: "" };
   return [...episode.events, own].sort((a, b) => a.step - b.step);
-});
+}
 
 /** What was taken away or exchanged, by name: read by nobody, or where that was not tried, not by the action queries. */
 const tried = computed(() => {
@@ -347,9 +378,9 @@ const REPLANS_PER_SECOND = 10;
 effect(() => {
   if (!playing.value) return;
   const timer = setInterval(() => {
-    const next = replan.peek() + 1;
-    if (next >= numReplans.peek()) playing.value = false;
-    else setPart({ replan: next });
+    const before = moment.peek();
+    walk(1);
+    if (moment.peek() === before) playing.value = false;
   }, 1000 / REPLANS_PER_SECOND);
   return () => clearInterval(timer);
 });
