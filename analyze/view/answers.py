@@ -5,7 +5,8 @@ runs/0/numbers.json                         of a run: what is computed meanwhile
 runs/0/EPISODE/about.json                   what happened, and what every key is
 runs/0/EPISODE/effects.json                 how the action changes without a word, an object, a picture
 runs/0/EPISODE/actions/NUMBER.npy           the actions of the calls of one effect
-runs/0/EPISODE/pictures/CAMERA/REPLAN.png   film.gif: all of them, with the attention on them
+runs/0/EPISODE/pictures/CAMERA/REPLAN.png   film.gif: all of them, with the attention on them;
+                                            ?site=&layer=&head=&denoise= as they are shown
 runs/0/EPISODE/SITE/objects.json            which cells of the pictures objects cover
 runs/0/EPISODE/SITE/rows/LAYER.npy          rows of a layer, or of the mean of all; heads/LAYER.npy: of every head
 runs/0/EPISODE/SITE/uniform/LAYER.npy       what uniform attention gives in their place
@@ -76,8 +77,11 @@ class Answers:
             case ["actions", file]:
                 return npy(shown.changed_actions(_number(file, ".npy"))), NPY
             case ["film.gif"]:
+                layer, head, denoise = (query.get(name, [MEAN])[0] for name in ("layer", "head", "denoise"))
+                if not all(one == MEAN or (one.isdecimal() and len(one) < 9) for one in (layer, head, denoise)):
+                    raise NothingThere
                 with self._drawing:
-                    return shown.film(), "image/gif"
+                    return shown.film(query.get("site", [None])[0], layer, head, denoise), "image/gif"
             case ["pictures", camera, file]:
                 return shown.picture(camera, _number(file, ".png")), PNG
             case [site, *of_site] if site in [known.name for known in shown.store.attributes.sites]:

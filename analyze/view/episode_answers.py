@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -54,6 +55,10 @@ _COVERED = 0.1
 _FEWEST_CLOSED = 3
 #: The layer that stands for the mean of all.
 MEAN = "mean"
+
+
+#: What names of groups cannot have.
+_IN_NAMES = re.compile(r"[^A-Za-z0-9_]+")
 
 
 @dataclass(frozen=True)
@@ -184,10 +189,20 @@ class ShownEpisode:
         Image.fromarray(np.ascontiguousarray(picture)).save(file, "PNG", compress_level=1)
         return file.getvalue()
 
-    def film(self) -> bytes:
-        """The pictures with the attention on them as a GIF, as `vla-attention overlay --video gif` makes it."""
+    def film(self, site: str | None, layer: str, head: str, denoise: str) -> bytes:
+        """The pictures with the attention on them as a GIF, as `vla-attention overlay --video gif` makes it.
+
+        site: None is the first one. layer, head, denoise: a number, or `MEAN`. Lines go around the objects that the
+        policy was told about.
+        """
         only, number = replace(self.store, episodes=(self.episode,)), self.episode.attributes.episode_index
-        result = answer_to("overlay", [only], AnalysisSettings(), {"episode": number, "video": "gif"})
+        layers, heads = ((int(one),) if one != MEAN else None for one in (layer, head))
+        steps = None if denoise == MEAN else (denoise,)
+        settings = AnalysisSettings(layers=layers, heads=heads, denoise=steps, site=site)
+        seen = [thing.name for thing in self.item(self._site_names[0]).tokens.objects if thing.name in self.named]
+        outlines = [f"{_IN_NAMES.sub('_', name)}=object:{_quoted(name)}" for name in seen]
+        options = {"episode": number, "video": "gif", "outline": outlines}
+        result = answer_to("overlay", [only], settings, options)
         ((name, write),) = result.files.items()
         with tempfile.TemporaryDirectory() as folder:
             write(Path(folder) / name)

@@ -332,3 +332,56 @@ def test_two_episodes_are_one_time_line_over_the_longer_one(browser, store, tmp_
         view.wait_for_link("run=1")
         assert view.page.inner_text(".scrub output").startswith(f"step {starts[1][-1]} of {max(ends)}, longer.zarr")
         assert view.complaints == []
+
+
+def saved(view: Watched, kind: str) -> bytes:
+    """What the page's button saves."""
+    if not view.page.locator(".drawer").count():
+        view.page.click("text=share")
+    with view.page.expect_download() as download:
+        view.page.click(f"text=Save {kind}")
+    return Path(download.value.path()).read_bytes()
+
+
+def test_a_saved_figure_is_drawn_by_a_program_that_is_no_browser(browser):
+    """The pictures as they were stored, thin lines on them, and what both sides are."""
+    import resvg_py
+
+    path = va.example("cubes")
+    names = [
+        f"task{task:03}_episode{number:03}"
+        for task, number in va.open(path).episodes.select("task_id", "episode_index").rows()
+    ]
+    with served(path) as running, watched_page(browser) as view:
+        view.open(f"{running.link}#episode={names[0]}&beside=0:{names[1]}&replan=1&group=words:0")
+        text = saved(view, "SVG").decode()
+        assert view.complaints == []
+        abouts = [json.loads(ask(running, f"runs/0/{name}/about.json").body) for name in names[:2]]
+        (camera, _), *_ = abouts[0]["sites"]["joint"]["cameras"].items()
+        stored = Image.open(io.BytesIO(ask(running, f"runs/0/{names[0]}/pictures/{camera}/1.png").body))
+        png = Image.open(io.BytesIO(saved(view, "PNG")))
+    written = re.findall(r"<text[^>]*>([^<]*)</text>", text)
+    for about in abouts:
+        assert f"step {about['starts'][1]} of {about['end']}, call 1 of 0 to {len(about['starts']) - 1}" in written
+        assert about["verdict"] in written
+    place = re.search(r'<g transform="translate\((\d+) (\d+)\)"><image width="(\d+)" height="(\d+)"', text)
+    assert place is not None
+    x, y, width, height = map(int, place.groups())
+    drawn = Image.open(io.BytesIO(bytes(resvg_py.svg_to_bytes(svg_string=text)))).convert("RGB")
+    assert (2 * drawn.width, 2 * drawn.height) == pytest.approx(png.size, abs=2)
+    shown = np.asarray(drawn.crop((12 + x, 12 + y, 12 + x + width, 12 + y + height)), dtype=int)
+    plain = np.asarray(stored.convert("RGB").resize((width, height), Image.Resampling.BICUBIC), dtype=int)
+    changed = (np.abs(shown - plain) > 60).any(axis=-1).mean()
+    assert 0.001 < changed < 0.2
+
+
+def test_the_film_is_of_what_is_shown(server):
+    films = {
+        asked: ask(server, f"runs/0/task000_episode000/film.gif?{asked}").body
+        for asked in ("", "layer=mean&head=mean&denoise=mean&site=joint", "layer=2", "head=1", "denoise=0")
+    }
+    plain = films.pop("")
+    assert films.pop("layer=mean&head=mean&denoise=mean&site=joint") == plain
+    assert len({*films.values(), plain}) == 4
+    assert "no layer 99" in json.loads(ask(server, "runs/0/task000_episode000/film.gif?layer=99").body)["error"]
+    assert ask(server, "runs/0/task000_episode000/film.gif?layer=x").status == 404

@@ -4,10 +4,11 @@ import { signal } from "@preact/signals";
 import { Actions } from "./actions";
 import { address, type EpisodeLine } from "./answers";
 import { EffectTable } from "./effects";
+import { figure } from "./figure";
 import { HeadGrid } from "./heads";
 import { OwnGroup, Ratio } from "./numbers";
 import { kindOf } from "./overview";
-import { Legend, levels, Pictures } from "./pictures";
+import { Legend, Pictures } from "./pictures";
 import {
   about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameInRun, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, type Scene, setPart,
   sides, site, step, swap,
@@ -124,47 +125,8 @@ export function commandLine(): string {
   return parts.join(" ");
 }
 
-const LINE_STYLES = ["fill", "stroke", "stroke-width", "stroke-dasharray", "vector-effect"];
-const GAP = 8;
-
-/** The pictures with their lines as an SVG that needs no other file. */
-function picturesAsSvg(): { text: string; width: number; height: number } {
-  let x = 0;
-  let height = 0;
-  const parts = [...document.querySelectorAll<HTMLElement>(".pictures .stack")].map((stack) => {
-    const box = stack.getBoundingClientRect();
-    const lines = stack.querySelector("svg")!;
-    const copy = lines.cloneNode(true) as SVGElement;
-    const drawn = [...lines.querySelectorAll("path")];
-    copy.querySelectorAll("path").forEach((path, i) => {
-      for (const name of LINE_STYLES) path.setAttribute(name, getComputedStyle(drawn[i]!).getPropertyValue(name));
-    });
-    copy.querySelector("rect")?.remove();
-    const place = { x, y: 0, width: box.width, height: box.height };
-    for (const [name, value] of Object.entries(place)) copy.setAttribute(name, String(value));
-    const picture = stack.querySelector("img");
-    let image = "";
-    if (picture) {
-      const canvas = document.createElement("canvas");
-      [canvas.width, canvas.height] = [picture.naturalWidth, picture.naturalHeight];
-      canvas.getContext("2d")!.drawImage(picture, 0, 0);
-      image = `<image x="${x}" width="${box.width}" height="${box.height}" preserveAspectRatio="none" href="${canvas.toDataURL("image/png")}"/>`;
-    }
-    x += box.width + GAP;
-    height = Math.max(height, box.height);
-    return image + new XMLSerializer().serializeToString(copy);
-  });
-  const width = Math.max(1, x - GAP);
-  const episode = about.value.value!;
-  const chosen = [["layer", layer.value], ["head", head.value], ["denoise step", denoise.value]].map(([name, one]) => `${name} ${one}`).join(", ");
-  const lines = [episode.verdict, `step ${episode.starts[replan.value]} of ${episode.end}; ${chosen}; lines: ${levels.value.join(" and ")} times an even spread; dashed: named or touched`];
-  const texts = lines.map((line, i) => `<text x="0" y="${height + 18 + 18 * i}" font-family="sans-serif" font-size="13">${line.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`);
-  height += 46;
-  return { text: `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}"><rect width="100%" height="100%" fill="#fff"/>${parts.join("")}${texts.join("")}</svg>`, width, height };
-}
-
 async function savePictures(kind: "png" | "svg"): Promise<void> {
-  const { text, width, height } = picturesAsSvg();
+  const { text, width, height } = await figure();
   const link = document.createElement("a");
   link.href = `data:image/svg+xml,${encodeURIComponent(text)}`;
   if (kind === "png") {
@@ -191,7 +153,7 @@ function Drawer() {
         <button onClick={() => copy("link", location.href)}>Copy link</button>{" "}
         <button onClick={() => void savePictures("png")}>Save PNG</button>{" "}
         <button onClick={() => void savePictures("svg")}>Save SVG</button>{" "}
-        {runs.value.value?.copy ? null : <><a class="button" href={`${address.episode(runNumber.value, episodeName.value)}/film.gif`} download={`${episodeName.value}.gif`}>Save GIF</a>{" "}</>}
+        {runs.value.value?.copy ? null : <><a class="button" href={`${address.episode(runNumber.value, episodeName.value)}/film.gif?${new URLSearchParams({ site: site.value, layer: `${layer.value}`, head: `${head.value}`, denoise: `${denoise.value}` })}`} download={`${episodeName.value}.gif`}>Save GIF</a>{" "}</>}
         <button onClick={() => copy("command", command)}>Copy command</button> <span role="status">{copied}</span>
       </p>
       <p><code>{command}</code> <span class="soft">draws this episode in a terminal.</span></p>

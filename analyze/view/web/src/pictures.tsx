@@ -26,33 +26,56 @@ export const levels = computed<readonly number[]>(() => {
   return second === undefined ? [FIRST] : [FIRST, second];
 });
 
-interface At {
+export interface At {
   readonly scene: Scene;
   readonly camera: string;
   readonly how: CameraLayout;
   readonly at: number;
 }
 
-function Lines({ scene, camera, how, at }: At) {
+/** How lines are drawn, one over the other: [colour, width in pixels, dashes]. A saved picture has no style sheet. */
+export const STROKES = {
+  first: [["#000", 3.4, ""], ["#fff", 1.4, ""]],
+  second: [["#000", 5, ""], ["#f0e442", 2.6, ""]],
+  named: [["#00c08b", 2.4, "5 4"]],
+  touched: [["#ff6a1f", 2.4, "5 4"]],
+  picked: [["#56b4e9", 3, ""]],
+} as const;
+export type Kind = keyof typeof STROKES;
+
+/** What a kind of lines says; empty where none of it can be there. */
+export const meaning = (kind: Kind): string => ({
+  first: `${FIRST} times an even spread`,
+  second: levels.value[1] ? `${levels.value[1]} times` : "",
+  named: about.value.value?.objects.length && covered.value.value ? "named in the sentence" : "",
+  touched: about.value.value?.objects.length && covered.value.value ? "touched" : "",
+  picked: "",
+})[kind];
+
+/** The lines of a picture: their kind, the cells that they go around, and of an object its name. */
+export function linesOf({ scene, camera, how, at }: At): { kind: Kind; inside: (cell: number) => boolean; title: string }[] {
   const [mass, even] = [massesOf(scene, at), evenOf(scene, at)];
   const lifts = mass && even ? cellLifts(mass, even, how) : null;
-  const own = cellsOf(scene, camera);
-  const things = scene.covered.value.value?.[camera] ?? {};
   const episode = scene.about.value.value;
   const touched = new Set(episode?.events.map(({ thing }) => thing));
-  return (
-    <>
-      {lifts ? levels.value.map((level, i) => {
-        const path = outline(how, (cell) => lifts[cell]! >= level);
-        return <g key={level} class={i ? "second" : "first"}><path class="casing" d={path} /><path class="line" d={path} /></g>;
-      }) : null}
-      {episode?.objects.filter(({ named, name }) => named || touched.has(name)).map(({ name, shown: title, named }) => {
-        const cells = new Set(things[name]?.[at] ?? []);
-        return cells.size ? <path key={name} class={named ? "object named" : "object touched"} d={outline(how, (cell) => cells.has(cell))}><title>{title}</title></path> : null;
-      })}
-      {own.length ? <path class="picked" d={outline(how, (cell) => own.includes(cell))} /> : null}
-    </>
-  );
+  const things = (episode?.objects ?? []).filter(({ named, name }) => named || touched.has(name)).flatMap(({ name, shown: title, named }) => {
+    const cells = new Set(scene.covered.value.value?.[camera]?.[name]?.[at] ?? []);
+    return cells.size ? [{ kind: named ? ("named" as const) : ("touched" as const), inside: (cell: number) => cells.has(cell), title }] : [];
+  });
+  const own = new Set(cellsOf(scene, camera));
+  return [
+    ...(lifts ? levels.value.map((level, i) => ({ kind: i ? ("second" as const) : ("first" as const), inside: (cell: number) => lifts[cell]! >= level, title: "" })) : []),
+    ...things,
+    ...(own.size ? [{ kind: "picked" as const, inside: (cell: number) => own.has(cell), title: "" }] : []),
+  ];
+}
+
+function Strokes({ kind, path, title }: { kind: Kind; path: string; title?: string }) {
+  return <g class={kind}>{STROKES[kind].map(([stroke, width, dash]) => <path key={stroke} d={path} stroke={stroke} stroke-width={width} stroke-dasharray={dash}>{title ? <title>{title}</title> : null}</path>)}</g>;
+}
+
+function Lines(one: At) {
+  return <>{linesOf(one).map(({ kind, inside, title }, i) => <Strokes key={i} kind={kind} path={outline(one.how, inside)} title={title} />)}</>;
 }
 
 function cellAt(event: MouseEvent & { currentTarget: Element }, how: CameraLayout): number {
@@ -132,9 +155,7 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
 export function Legend() {
   return (
     <p class="legend soft">
-      <span><svg viewBox="0 0 24 8" class="sample first"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{FIRST} times an even spread</span>
-      {levels.value[1] ? <span><svg viewBox="0 0 24 8" class="sample second"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{levels.value[1]} times</span> : null}
-      {about.value.value?.objects.length && covered.value.value ? <><span><svg viewBox="0 0 24 8" class="sample"><path class="object named" d="M2 4H22" /></svg>named in the sentence</span> <span><svg viewBox="0 0 24 8" class="sample"><path class="object touched" d="M2 4H22" /></svg>touched</span></> : null}
+      {(Object.keys(STROKES) as Kind[]).filter(meaning).map((kind) => <span key={kind}><svg viewBox="0 0 24 8" class="sample"><Strokes kind={kind} path="M2 4H22" /></svg>{meaning(kind)}</span>)}
     </p>
   );
 }

@@ -44,8 +44,8 @@ export function cellLifts(masses: ArrayLike<number>, uniform: ArrayLike<number>,
   return cellSums(masses, camera).map((mass, cell) => (even[cell]! > 0 ? mass / even[cell]! : NaN));
 }
 
-/** Lines around the cells for which `inside` holds, as a path in units of cells. */
-export function outline({ rows, columns }: { rows: number; columns: number }, inside: (cell: number) => boolean): string {
+/** Lines around the cells for which `inside` holds, as a path in units of cells, or of so many pixels a cell. */
+export function outline({ rows, columns }: { rows: number; columns: number }, inside: (cell: number) => boolean, [wide, high]: readonly [number, number] = [1, 1]): string {
   const parts: string[] = [];
   const holds = (row: number, column: number): boolean =>
     row >= 0 && row < rows && column >= 0 && column < columns && inside(row * columns + column);
@@ -55,7 +55,7 @@ export function outline({ rows, columns }: { rows: number; columns: number }, in
       const edge = column < columns && holds(row, column) !== holds(row - 1, column);
       if (edge && begin < 0) begin = column;
       if (!edge && begin >= 0) {
-        parts.push(`M${begin} ${row}H${column}`);
+        parts.push(`M${begin * wide} ${row * high}H${column * wide}`);
         begin = -1;
       }
     }
@@ -65,7 +65,7 @@ export function outline({ rows, columns }: { rows: number; columns: number }, in
       const edge = row < rows && holds(row, column) !== holds(row, column - 1);
       if (edge && begin < 0) begin = row;
       if (!edge && begin >= 0) {
-        parts.push(`M${column} ${begin}V${row}`);
+        parts.push(`M${column * wide} ${begin * high}V${row * high}`);
         begin = -1;
       }
     }
