@@ -84,10 +84,8 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
     every = [episode_maps(question, item, names) for item in chosen]
     ratios = _ratios(of_chosen)
     shown = [_chosen_replans(maps, replans, num_replans) for maps in every]
-    drawn = zip(every, shown, strict=True)
-    high = scale_end(
-        np.concatenate([one.lift[list(which)].ravel() for maps, which in drawn for one in maps.cameras.values()])
-    )
+    # Of all their policy calls, so that lines mean the same in a strip, in a film and on the page.
+    high = scale_end(np.concatenate([one.lift.ravel() for maps in every for one in maps.cameras.values()]))
     levels = line_levels(high)
     of_words = np.array([lift for maps in every for line in maps.words for _, lift in line])
     options = {"high": high, "levels": levels, "smooth": smooth, "outlines": list(groups.names) if groups else [],

@@ -385,3 +385,15 @@ def test_the_film_is_of_what_is_shown(server):
     assert len({*films.values(), plain}) == 4
     assert "no layer 99" in json.loads(ask(server, "runs/0/task000_episode000/film.gif?layer=99").body)["error"]
     assert ask(server, "runs/0/task000_episode000/film.gif?layer=x").status == 404
+
+
+@pytest.mark.parametrize("chosen", [{}, {"layers": 2}, {"layers": 3, "heads": 1}])
+def test_lines_stand_where_overlay_has_them(browser, chosen):
+    path = va.example("cubes")
+    (task, number), *_ = va.open(path).episodes.select("task_id", "episode_index").rows()
+    figure = va.open(path).overlay(tasks=task, episode=number, replans=[0], **chosen).figures[0]
+    asked = "".join(f"&{name.removesuffix('s')}={value}" for name, value in chosen.items())
+    with served(path) as running, watched_page(browser) as view:
+        view.open(f"{running.link}#episode=task{task:03}_episode{number:03}{asked}")
+        said = " ".join(view.page.locator(".legend span").all_inner_texts())
+    assert [float(one) for one in re.findall(r"(\d+) times", said)] == list(figure.options["levels"])

@@ -6,23 +6,23 @@ import { Hint } from "./hint";
 import {
   about, cellsOf, covered, evenOf, groupOf, hasCells, layout, main, massesAt, massesOf, numReplans, picked, type Scene, setPart, toggled, uniformAt,
 } from "./state";
-import { cellLifts, cellSums, outline, percent, shown } from "./sums";
+import { cellLifts, cellSums, outline, percent, scaleEnd, shown } from "./sums";
 
-/** Lines stand at this many times what even attention gives; the second is the highest that an episode's maps reach. */
+/** Lines stand at this many times what even attention gives; the second is the highest that the maps reach. */
 const FIRST = 2;
 const SECOND = [50, 20, 10, 5];
 
 /** The cell under the pointer. */
 const pointed = signal<{ scene: Scene; camera: string; cell: number } | null>(null);
 
-/** Of both lines, over the whole episode so that they mean the same at every replan. */
+/** Of both lines, over the whole episode so that they mean the same at every call, and in `vla-attention overlay`. */
 export const levels = computed<readonly number[]>(() => {
-  let highest = 0;
+  const lifts: number[] = [];
   for (let at = 0; at < numReplans.value; at++) {
     const [mass, even] = [massesAt(at), uniformAt(at)];
-    if (mass && even) for (const camera of Object.values(layout.value?.cameras ?? {})) for (const lift of cellLifts(mass, even, camera)) if (lift > highest) highest = lift;
+    if (mass && even) for (const camera of Object.values(layout.value?.cameras ?? {})) lifts.push(...cellLifts(mass, even, camera));
   }
-  const second = SECOND.find((level) => level <= 0.8 * highest);
+  const second = SECOND.find((level) => level <= 0.8 * scaleEnd(lifts));
   return second === undefined ? [FIRST] : [FIRST, second];
 });
 

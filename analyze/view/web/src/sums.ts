@@ -87,3 +87,13 @@ export function percent(value: number | null | undefined): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return "-";
   return `${Number((100 * value).toPrecision(100 * value >= 10 ? 3 : 2))}%`;
 }
+
+/** Where a scale of lifts ends, as `scale_end` of analyze/core/camera_maps.py has it. */
+export function scaleEnd(lifts: readonly number[]): number {
+  const sorted = lifts.filter(Number.isFinite).sort((a, b) => a - b);
+  const at = 0.995 * (sorted.length - 1);
+  const [below, above] = [sorted[Math.floor(at)] ?? 0, sorted[Math.ceil(at)] ?? 0];
+  const high = Math.max(4, below + (at - Math.floor(at)) * (above - below) || 0);
+  const step = 10 ** (Math.floor(Math.log10(high)) - 1);
+  return Math.ceil(Number((high / step).toFixed(9))) * step;
+}
