@@ -320,9 +320,9 @@ def test_two_episodes_are_one_time_line_over_the_longer_one(browser, store, tmp_
             said = view.page.inner_text(".scrub output")
             calls = [sum(start <= step for start in of) - 1 for of in starts]
             assert said.startswith(
-                f"step {step} of {max(ends)}, run.zarr, task 0, episode 0: call {calls[0]} of 0 to 2"
+                f"step {step} of {max(ends)}, run.zarr, task 0, episode 0: call {calls[0]} (0 to 2)"
             )
-            assert f"longer.zarr, task 0, episode 0: call {calls[1]} of 0 to 4" in said
+            assert f"longer.zarr, task 0, episode 0: call {calls[1]} (0 to 4)" in said
             assert (", ended" in said) is (step >= ends[0])
             view.page.keyboard.press("ArrowRight")
             view.settle()
@@ -362,7 +362,7 @@ def test_a_saved_figure_is_drawn_by_a_program_that_is_no_browser(browser):
         png = Image.open(io.BytesIO(saved(view, "PNG")))
     written = re.findall(r"<text[^>]*>([^<]*)</text>", text)
     for about in abouts:
-        assert f"step {about['starts'][1]} of {about['end']}, call 1 of 0 to {len(about['starts']) - 1}" in written
+        assert f"step {about['starts'][1]} of {about['end']}, call 1 (0 to {len(about['starts']) - 1})" in written
         assert about["verdict"] in written
     place = re.search(r'<g transform="translate\((\d+) (\d+)\)"><image width="(\d+)" height="(\d+)"', text)
     assert place is not None

@@ -48,7 +48,7 @@ async function drawnSide({ scene, at }: Side): Promise<Drawn> {
   const cameras = Object.entries(scene.layout.value?.cameras ?? {});
   const width = Math.max(PICTURE, cameras.length * (PICTURE + GAP) - GAP);
   const name = `${runs.value.value?.runs[scene.run.value]?.name}, task ${episode.task}, ${nameInRun(episode)}`;
-  const heads = [...wrapped(name, 0.9 * width).map((line) => [line, true] as const), ...wrapped(episode.verdict, width).map((line) => [line, false] as const), [`step ${episode.starts[at]} of ${episode.end}, call ${at} of 0 to ${episode.starts.length - 1}`, false] as const];
+  const heads = [...wrapped(name, 0.9 * width).map((line) => [line, true] as const), ...wrapped(episode.verdict, width).map((line) => [line, false] as const), [`step ${episode.starts[at]} of ${episode.end}, call ${at} (0 to ${episode.starts.length - 1})`, false] as const];
   const texts = heads.map(([line, bold], i) => written(line, 0, (i + 1) * LINE - 4, bold));
   const top = heads.length * LINE + 4;
   let high = 0;

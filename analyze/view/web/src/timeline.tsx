@@ -124,7 +124,7 @@ function Events({ side }: { side: Side }) {
 /** Which call of an episode is shown, and whether it has ended before. */
 function callOf({ scene, at }: Side): string {
   const { starts, end: own } = scene.about.value.value!;
-  return `call ${at} of 0 to ${starts.length - 1}${moment.value >= own ? ", ended" : ""}`;
+  return `call ${at} (0 to ${starts.length - 1})${moment.value >= own ? ", ended" : ""}`;
 }
 
 export function Timeline() {
