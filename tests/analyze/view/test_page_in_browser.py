@@ -177,6 +177,25 @@ def test_the_overview_finds_episodes(view, server, store):
     assert shown == [float(f"{ratio:.3g}") for ratio in ratios["geometric_mean"]]
 
 
+def test_the_overview_is_sorted(view, server, store):
+    """By what every card says; unknown orders of a link are none."""
+    view.open(server.link)
+    view.page.wait_for_selector(".card .soft")
+    names = va.open(store).episodes.sort("task_id", "episode_index")
+    ratios = va.open(store).analyze()["episodes"].filter(layer="layers_avg").sort("task_id", "episode_index")
+    known = {"outcome": names["success"], "shortest": names["num_steps"], "longest": -names["num_steps"]}
+    known |= {"lowest": ratios["geometric_mean"], "highest": -ratios["geometric_mean"]}
+    places = names.select("task_id", "episode_index").rows()
+    for order, values in known.items():
+        view.page.select_option('select[aria-label="Order"]', order)
+        view.wait_for_link(f"sort={order}")
+        shown = view.page.locator(".card").evaluate_all("all => all.map((one) => one.dataset.episode)")
+        wanted = sorted(range(len(places)), key=lambda place, values=values: float(values[place]))
+        assert shown == [f"task{places[place][0]:03}_episode{places[place][1]:03}" for place in wanted]
+    view.open(f"{server.link}#sort=constructor&show=constructor")
+    assert view.page.locator(".card").count() == len(places)
+
+
 def test_outside_of_the_lines_no_pixel_of_a_picture_changes(view, server):
     """The picture is laid out in its own size; where no line is drawn, the screen shows its pixels."""
     view.open(f"{server.link}{FIRST}")
@@ -319,9 +338,7 @@ def test_two_episodes_are_one_time_line_over_the_longer_one(browser, store, tmp_
         for step in starts[1]:
             said = view.page.inner_text(".scrub output")
             calls = [sum(start <= step for start in of) - 1 for of in starts]
-            assert said.startswith(
-                f"step {step} of {max(ends)}, run.zarr, task 0, episode 0: call {calls[0]} (0 to 2)"
-            )
+            assert said.startswith(f"step {step} of {max(ends)}, run.zarr, task 0, episode 0: call {calls[0]} (0 to 2)")
             assert f"longer.zarr, task 0, episode 0: call {calls[1]} (0 to 4)" in said
             assert (", ended" in said) is (step >= ends[0])
             view.page.keyboard.press("ArrowRight")

@@ -33,8 +33,21 @@ const medians = computed(() => {
   return new Map([...of].map(([task, steps]) => [task, steps.sort((a, b) => a - b)[Math.floor(steps.length / 2)]!]));
 });
 
+/** In which order episodes stand, by a number of each; without one by task. Those without a number stand last. */
+const orders: Record<string, { name: string; of: (line: EpisodeLine) => number | null | undefined }> = {
+  task: { name: "by task", of: () => 0 },
+  outcome: { name: "failed first", of: ({ outcome }) => (outcome === false ? 0 : outcome === true ? 1 : null) },
+  shortest: { name: "fewest steps first", of: ({ num_steps }) => num_steps || null },
+  longest: { name: "most steps first", of: ({ num_steps }) => (num_steps ? -num_steps : null) },
+  lowest: { name: "lowest ratio first", of: ({ name }) => numbersOf.value.get(name)?.ratio },
+  highest: { name: "highest ratio first", of: ({ name }) => { const ratio = numbersOf.value.get(name)?.ratio; return ratio == null ? null : -ratio; } },
+};
+const numbersOf = computed(() => new Map((runNumbers.value?.episodes ?? []).map((one) => [one.name, one])));
+/** What a link names, or what stands first where there is nothing of that name. */
+const chosen = <T,>(all: Record<string, T>, name: string): T => (Object.keys(all).includes(name) ? all[name]! : Object.values(all)[0]!);
+
 const listed = computed(() => {
-  const chip = chips[part("show")] ?? chips.all!;
+  const chip = chosen(chips, part("show"));
   return (run.value?.episodes ?? []).filter((line) => (part("task") === "" || part("task") === String(line.task)) && chip.holds(line, medians.value.get(line.task)!) && fits(line, part("find")));
 });
 
@@ -42,6 +55,11 @@ const ids = computed(() => [...new Set(run.value?.episodes.map(({ task }) => tas
 
 const tasks = computed(() => {
   const of = new Map<string, EpisodeLine[]>();
+  const order = chosen(orders, part("sort"));
+  if (order !== orders.task) {
+    const key = (line: EpisodeLine): number => order.of(line) ?? Infinity;
+    return listed.value.length ? [{ task: "", instruction: "", lines: [...listed.value].sort((a, b) => key(a) - key(b) || 0) }] : [];
+  }
   for (const line of listed.value) {
     const title = line.failed === undefined ? `${line.task}\t${line.instruction}` : `${line.task}\t`;
     of.set(title, [...(of.get(title) ?? []), line]);
@@ -56,7 +74,7 @@ export function kindOf(line: EpisodeLine): "solved" | "failed" | "unknown" {
 const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·");
 
 function Card({ line }: { line: EpisodeLine }) {
-  const numbers = runNumbers.value?.episodes.find(({ name }) => name === line.name);
+  const numbers = numbersOf.value.get(line.name);
   return (
     <button class={`card ${kindOf(line)}`} data-episode={line.name} title={line.failed ?? line.verdict} onClick={() => openEpisode(line.name)}>
       {line.picture ? (
@@ -65,7 +83,7 @@ function Card({ line }: { line: EpisodeLine }) {
         <span class="no-picture">{line.failed === undefined ? "no pictures" : "cannot be read"}</span>
       )}
       <span class="about">
-        <b>{mark(line)} {line.scene == null ? line.episode : `scene ${line.scene}`}</b>
+        <b>{mark(line)} {chosen(orders, part("sort")) === orders.task ? "" : `task ${line.task}, `}{line.scene == null ? line.episode : `scene ${line.scene}`}</b>
         {line.num_steps ? <span>{line.num_steps} steps</span> : null}
         {numbers?.ratio != null ? <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)</span> : null}
       </span>
@@ -158,6 +176,9 @@ export function Overview() {
             {ids.value.map((task) => <option value={String(task)}>task {task}</option>)}
           </select>
         ) : null}
+        <select aria-label="Order" value={chosen(orders, part("sort")) === orders.task ? "task" : part("sort")} onChange={(event) => setPart({ sort: event.currentTarget.value })}>
+          {Object.entries(orders).map(([name, { name: text }]) => <option value={name}>{text}</option>)}
+        </select>
         <input type="search" aria-label="Find episodes" placeholder="find: red, failed, not solved …" value={part("find")} onInput={(event) => setPart({ find: event.currentTarget.value })} />
         <span class="soft" role="status">{listed.value.length} of {shownRun.episodes.length} episodes</span>
       </div>
@@ -165,7 +186,7 @@ export function Overview() {
       <div class={`tasks of-${Math.max(0, ...tasks.value.map(({ lines }) => lines.length))}`}>
         {tasks.value.map(({ task, instruction, lines }) => (
         <section class="task" key={`${task} ${instruction}`}>
-          <h2><span class="soft">task {task}</span> {instruction}</h2>
+          {task ? <h2><span class="soft">task {task}</span> {instruction}</h2> : null}
           <div class="cards">{lines.map((line) => <Card key={line.name} line={line} />)}</div>
         </section>
         ))}

@@ -37,7 +37,7 @@ export function answered<T>(ask: () => Promise<T> | null): ReadonlySignal<Answer
 /** The parts of the link, as texts; what is not in it has its default. */
 const DEFAULTS = {
   run: "0", episode: "", replan: "0", site: "", layer: "mean", head: "mean", denoise: "mean", words: "", beside: "", group: "",
-  without: "", find: "", task: "", show: "all", curve: "ratio", step: "",
+  without: "", find: "", task: "", show: "all", curve: "ratio", step: "", sort: "task",
 } as const;
 export type Part = keyof typeof DEFAULTS;
 
