@@ -34,6 +34,7 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.scan import Look, scan
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan, resolve_episode
 from vla_attention.analyze.measures.tables import LAYERS_AVG
+from vla_attention.analyze.render.style import group_styles
 from vla_attention.analyze.stores.rows import LayerRows, layer_rows
 from vla_attention.analyze.stores.run_notes import same_words, told_instruction
 from vla_attention.analyze.stores.selection import Selection, select
@@ -296,13 +297,14 @@ class ShownEpisode:
         groups = levels.groups("replan", "layer").collect()
         layers = [*map(str, question.selection.layer_labels), MEAN]
         columns = ("ratio", "uniform_ratio", "ratio_lift")
-        ratio = question.grouping.ratio
+        ratio, styles = question.grouping.ratio, group_styles(question.grouping.names)
         return {
             "layers": layers,
             "sides": None if ratio is None else [list(ratio.numerator), list(ratio.denominator)],
             **{name: _by_layer(replans, name, layers) for name in columns if ratio is not None},
             "groups": {
-                name: {
+                name: {"color": styles[name]["color"]}
+                | {
                     column: _by_layer(groups.filter(group=name), column, layers)
                     for column in ("keys", "mass", "fraction", "lift")
                 }

@@ -28,6 +28,7 @@ from tests.kit.viewer import ask, served
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, stored_picture, upright
 from vla_attention.analyze.measures.question import ask as question_of
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.render.style import group_styles
 from vla_attention.analyze.view.answers import Answers
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, _closings
 from vla_attention.schemas.episode_steps import TaskGoal
@@ -92,6 +93,7 @@ def test_ratios_and_masses(server, places, name, site, asked):
             expected = np.where(np.isfinite(expected), expected, np.nan)
             np.testing.assert_array_equal(numbers(given[column]), expected)
     for group, columns in given["groups"].items():
+        assert columns.pop("color") == group_styles(list(given["groups"]))[group]["color"]
         for column, values in columns.items():
             expected = of_analysis(result["replans_groups"], column, episode, group=group)
             np.testing.assert_array_equal(numbers(values), expected)

@@ -139,7 +139,7 @@ export interface Groups {
   readonly ratio?: Grid;
   readonly uniform_ratio?: Grid;
   readonly ratio_lift?: Grid;
-  readonly groups: Readonly<Record<string, { keys: Grid; mass: Grid; fraction: Grid; lift: Grid }>>;
+  readonly groups: Readonly<Record<string, { color: string; keys: Grid; mass: Grid; fraction: Grid; lift: Grid }>>;
 }
 
 /** (replan, layer, head) */

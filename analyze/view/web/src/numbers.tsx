@@ -10,7 +10,7 @@ export function Ratio() {
   if (groups.value.error) return <p class="soft">{groups.value.error}</p>;
   if (!numbers) return null;
   const at = (grid: typeof numbers.ratio): number | null => grid?.[replan.value]?.[layerPlace(numbers)] ?? null;
-  const parts = Object.entries(numbers.groups).map(([name, of]) => ({ name, fraction: at(of.fraction) ?? 0, mass: at(of.mass), keys: at(of.keys), lift: at(of.lift) })).filter(({ keys }) => (keys ?? 0) > 0);
+  const parts = Object.entries(numbers.groups).map(([name, of]) => ({ name, color: of.color, fraction: at(of.fraction) ?? 0, mass: at(of.mass), keys: at(of.keys), lift: at(of.lift) })).filter(({ keys }) => (keys ?? 0) > 0);
   return (
     <section class="ratio" aria-label="Attention in this call">
       {numbers.sides ? (
@@ -22,13 +22,13 @@ export function Ratio() {
         </p>
       ) : null}
       <div class="bar" role="img" aria-label={parts.map(({ name, fraction }) => `${name} ${percent(fraction)}`).join(", ")}>
-        {parts.map(({ name, fraction }, i) => <span key={name} class={`part part-${i % 6}`} style={{ flexGrow: String(fraction) }} title={`${name}: ${percent(fraction)}`} />)}
+        {parts.map(({ name, color, fraction }) => <span key={name} class="part" style={{ flexGrow: String(fraction), background: color }} title={`${name}: ${percent(fraction)}`} />)}
       </div>
       <table class="numbers">
         <thead><tr><td /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
         <tbody>
-          {parts.map(({ name, mass, keys, lift }, i) => (
-            <tr key={name} data-group={name}><th><span class={`dot part-${i % 6}`} />{name}</th><td>{shown(keys)}</td><td data-number={`mass-${name}`} data-value={mass}>{percent(mass)}</td><td>{shown(lift)}</td></tr>
+          {parts.map(({ name, color, mass, keys, lift }) => (
+            <tr key={name} data-group={name}><th><span class="dot" style={{ background: color }} />{name}</th><td>{shown(keys)}</td><td data-number={`mass-${name}`} data-value={mass}>{percent(mass)}</td><td>{shown(lift)}</td></tr>
           ))}
         </tbody>
       </table>

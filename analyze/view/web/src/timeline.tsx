@@ -10,6 +10,8 @@ import { range, sumOf } from "./sums";
 
 interface Curve {
   readonly name: string;
+  /** Of a group, as in every figure; else one of `COLOURS`. */
+  readonly color?: string;
   readonly values: readonly (number | null)[];
 }
 
@@ -29,7 +31,7 @@ function kinds(scene: Scene): Record<string, { title: string; of: () => Curves }
   const atReplans = (curves: Curve[]): Curves => ({ steps: episode?.starts ?? [], curves });
   const found: Record<string, { title: string; of: () => Curves }> = {};
   if (numbers?.ratio) found.ratio = { title: "ratio of pictures to text", of: () => atReplans([{ name: "ratio", values: column(numbers.ratio) }, { name: "if spread evenly", values: column(numbers.uniform_ratio) }]) };
-  if (numbers) found.masses = { title: "parts of the attention", of: () => atReplans(Object.entries(numbers.groups).map(([name, { fraction }]) => ({ name, values: column(fraction) })).filter(({ values }) => values.some((one) => (one ?? 0) > 0.005))) };
+  if (numbers) found.masses = { title: "parts of the attention", of: () => atReplans(Object.entries(numbers.groups).map(([name, { color, fraction }]) => ({ name, color, values: column(fraction) })).filter(({ values }) => values.some((one) => (one ?? 0) > 0.005))) };
   if (part("group")) found.group = { title: "own group", of: () => atReplans(["seen", "read"].map((side) => ({ name: side === "seen" ? "patches" : "words", values: (episode?.starts ?? []).map((_, at) => (massesOf(scene, at) ? sumOf(massesOf(scene, at)!, pickedKeys({ scene, at })[side as "seen" | "read"]) : null)) })).filter(({ values }) => values.some(Boolean))) };
   if (courses) {
     const steps = range(courses.gap.length);
@@ -54,7 +56,7 @@ function Plot({ curves, title }: { curves: Curves; title: string }) {
         width: place.clientWidth, height: 130, cursor: { drag: { x: false, y: false }, y: false }, legend: { live: false },
         scales: { x: { time: false, range: [0, last] } },
         axes: [{ ...axis, size: 28, label: undefined }, { ...axis, size: 46 }],
-        series: [{ label: "step" }, ...curves.curves.map(({ name }, i) => ({ label: name, stroke: COLOURS[i % COLOURS.length]!, width: 1.5, points: { show: false }, spanGaps: true, dash: i >= COLOURS.length ? [4, 3] : undefined }))],
+        series: [{ label: "step" }, ...curves.curves.map(({ name, color }, i) => ({ label: name, stroke: color ?? COLOURS[i % COLOURS.length]!, width: 1.5, points: { show: false }, spanGaps: true, dash: (color ? i >= curves.curves.length / sides.value.length : i >= COLOURS.length) ? [4, 3] : undefined }))],
         hooks: {
           draw: [(one) => {
             const x = one.valToPos(moment.peek(), "x", true);
@@ -91,8 +93,8 @@ function together(each: readonly (readonly [Side, Curves])[]): Curves {
   if (each.length === 1) return each[0]![1];
   const tables = each.map(([, { steps, curves }]) => [steps, ...curves.map(({ values }) => values)] as uPlot.AlignedData);
   const [steps, ...values] = uPlot.join(tables);
-  const names = each.flatMap(([side, { curves }]) => curves.map(({ name }) => `${nameOf(side)}: ${name}`));
-  return { steps: [...steps], curves: names.map((name, i) => ({ name, values: [...values[i]!] as (number | null)[] })) };
+  const all = each.flatMap(([side, { curves }]) => curves.map((curve) => ({ ...curve, name: `${nameOf(side)}: ${curve.name}` })));
+  return { steps: [...steps], curves: all.map((curve, i) => ({ ...curve, values: [...values[i]!] as (number | null)[] })) };
 }
 
 /** The same object until other numbers are drawn: a plot is made anew for each. */
