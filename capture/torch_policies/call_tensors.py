@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.interventions.factors import check_keys_left
-from vla_attention.capture.torch_policies.attention_calls import MASK_DISTANCE, MASKED_BELOW, NO_MASS, CallShape
+from vla_attention.capture.torch_policies.attention_calls import MASK_DISTANCE, MASKED_BELOW, CallShape
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -77,8 +77,6 @@ class Masks:
 
     def __init__(self) -> None:
         self._known: dict[tuple[Any, ...], tuple[Tensor | None, SeenKeys]] = {}
-        #: By the shape of rows: (batch, head, query, key) bool, which keys had mass, and which are seen.
-        self._by_mass: dict[torch.Size, tuple[Tensor, Tensor]] = {}
 
     def seen(
         self, mask: Tensor | None, causal: bool, queries: slice, sizes: tuple[int, int, int], device: torch.device
@@ -102,30 +100,6 @@ class Masks:
             known = _seen(mask, causal, queries, sizes, device)
             self._known[key] = mask, known
         return known
-
-    def seen_by(self, rows: Tensor, shown: Tensor, sinks: int, *, alike: bool) -> Tensor:
-        """Return the keys that queries see, (batch, head or 1, query, key) bool, of a softmax by hand.
-
-        Args:
-            rows: its probabilities, (batch, head, query, key).
-            shown: its logits without the last `sinks` keys, or which keys are seen.
-            sinks: keys of the softmax without values, which are seen.
-            alike: keys are taken for seen as in an earlier call of the block in which the same ones had mass.
-        """
-        massive = None
-        if alike and rows.device.type == "cpu":
-            massive = rows > NO_MASS
-            before, known = self._by_mass.get(rows.shape, (None, None))
-            if known is not None and before is not None and torch.equal(massive, before):
-                return known
-        seen = shown if shown.dtype is torch.bool else visible(shown)
-        if seen is None:
-            seen = torch.ones((), dtype=torch.bool, device=rows.device).expand(rows.shape[0], 1, *rows.shape[2:])
-        elif sinks:
-            seen = torch.nn.functional.pad(seen, (0, sinks), value=True)
-        if massive is not None:
-            self._by_mass[rows.shape] = massive, seen
-        return seen
 
 
 def _seen(

@@ -17,7 +17,7 @@ from torch._higher_order_ops.flex_attention import flex_attention as flex_operat
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.nn.attention.bias import CausalBias
 
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_tensors import (
     SeenKeys,
     batch_and_heads,
@@ -67,22 +67,15 @@ def watch_sdpa(
     if isinstance(given.attn_mask, CausalBias):  # it has no numbers of its own
         given = structs.replace(given, attn_mask=given.attn_mask._materialize(query.device))
 
-    path, module = mode.where()
-
-    def find_out() -> tuple[CallShape, tuple[list[int], int, int]]:
-        dtype = query.dtype if autocast is None else autocast
-        lead, keys = _lead(given), key.shape[-2]
-        batch, kernel_heads = batch_and_heads(lead, module)
-        kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
-        group = _packed_heads(module, query, key)
-        sizes = (batch, kernel_heads * group, kv_heads, query.shape[-2] // group, keys)
-        return mode.new_shape(path, "sdpa", sizes, dtype), (lead, kernel_heads, group)
-
-    shapes = (query.shape, key.shape, given.value.shape, None if given.attn_mask is None else given.attn_mask.shape)
     device = query.device.type
-    autocast = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else None
-    kind = (path, "sdpa", *shapes, given.enable_gqa, query.dtype, autocast)
-    shape, (lead, kernel_heads, group) = mode.shape_of(kind, find_out)
+    dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else query.dtype
+    path, module = mode.where()
+    lead = _lead(given)
+    batch, kernel_heads = batch_and_heads(lead, module)
+    kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
+    group = _packed_heads(module, query, key)
+    sizes = (batch, kernel_heads * group, kv_heads, query.shape[-2] // group, key.shape[-2])
+    shape = mode.new_shape(path, "sdpa", sizes, dtype)
     batch, heads, queries, keys = shape.batch, shape.heads, shape.queries, shape.keys
     kernel_queries, dim = query.shape[-2], query.shape[-1]
 
@@ -102,13 +95,13 @@ def watch_sdpa(
         before, after = changed_mask(folded_mask(), given.is_causal, change, queries, keys)
         check_change(before, after, shape)
         # As the kernel wants it: as many axes as its queries have.
-        logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(shape.torch_dtype)
+        logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(dtype)
         options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
         with sdpa_kernel(_ANY_KERNEL):
             output = function(query, key, given.value, logits, given.dropout_p, **options)
     if mode.passes(shape):
         return output
-    mask, dtype = folded_mask(), shape.torch_dtype
+    mask = folded_mask()
     folded_query = query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim)
     folded_key, values = (
         _folded(tensor.to(dtype), lead, batch, shape.kv_heads) for tensor in (key, given.value)

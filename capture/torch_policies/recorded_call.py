@@ -18,7 +18,7 @@ from vla_attention.capture.policies.random_numbers import RandomNumbers
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.torch_policies.attention_calls import CallShape, RowsRefused
-from vla_attention.capture.torch_policies.call_order import CallPlace
+from vla_attention.capture.torch_policies.call_order import CallPlace, CallsDoNotFit
 from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.own_setting import BatchRowsMixed
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
@@ -118,7 +118,11 @@ class WatchedCall(ReplanRecorder):
             BatchRowsMixed: the rows of the batch are not those of the environments.
             RowsRefused: heads and queries are exchanged.
         """
-        rows_of_sites = super().finish()
+        try:
+            rows_of_sites = super().finish()
+        except CallsDoNotFit:
+            self._run._found.places.doubt()  # attention may have moved to where it was not watched
+            raise
         if self.contributions.turned:
             raise RowsRefused(
                 "The rows have heads for queries, and queries for heads: the policy's softmax is over (batch, query, "

@@ -212,6 +212,16 @@ class ReplanContributions:
             sums[key] = number if sums.get(key, number) == number else None
         return sums
 
+    def compare_sums(self, known: Mapping[tuple[str, int], int]) -> None:
+        """Lose the contributions of blocks whose stream is another sum than it was in other calls."""
+        for place, way in self._places:
+            number = known.get((place.site or "", place.block))
+            if number is not None and way.result() is not None and way.taken and len(way.taken) != number:
+                way.lost = (
+                    f"the residual stream is the sum number {len(way.taken)} with what the attention gave, and was "
+                    f"number {number} in the calls before: the policy computes something else than in its first calls"
+                )
+
 
 def _allowed(call: AttentionCall, dtypes: Iterable[torch.dtype]) -> float:
     """The largest difference, relative to the largest number, of what is computed twice in a call and behind it."""

@@ -268,6 +268,7 @@ class RecordedRun:
         """Raise `ContributionsUnknown` if contributions are recorded, and those of a call are not known."""
         unknown, of_batch = call.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
         if unknown is not None and self.attributes.recording.contributions:
+            self._found.places.doubt()
             raise ContributionsUnknown(
                 "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
                 f"residual stream: {unknown}{of_batch}. Record with contributions=False, or --no-contributions "

@@ -180,7 +180,7 @@ class ReplanRecorder(CallOrder):
             self.problems[f"of a call of site '{site.name}', {problem}"] = None
         rows = torch.threshold(rows, NO_MASS, 0.0)
         way, by_part = None, recording.contributions
-        self.contributions.expected = {} if self.whole else self.known.sums
+        self.contributions.expected = {} if self.whole or self._is_sample(place.block, site.name) else self.known.sums
         asks_of_axes = self.asks_of_axes and call.heads_may_be_queries
         if by_part or self.asks_of_batch or asks_of_axes:
             self.asks_of_batch, self.asks_of_axes = False, self.asks_of_axes and not asks_of_axes
@@ -198,11 +198,16 @@ class ReplanRecorder(CallOrder):
         All are in a call that is watched throughout, and those that have another shape than before; else those of one
         block, another one from call to call.
         """
-        alike, blocks = structs.replace(shape, number=0), self.known.blocks[site]
+        alike = structs.replace(shape, number=0)
         if self.whole or alike not in self.known.compared:
             self.known.compared.add(alike)
             return True
-        return place.block == blocks[self.number % len(blocks)]
+        return self._is_sample(place.block, site)
+
+    def _is_sample(self, block: int, site: str) -> bool:
+        """Whether a block of a site is the one that is looked at wholly in this call, another one from call to call."""
+        blocks = self.known.blocks[site]
+        return block == blocks[self.number % len(blocks)]
 
     def _check(self, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
         """Raise an error unless rows (batch, head, query, key) give what the policy's own kernel gave."""
@@ -247,9 +252,11 @@ class ReplanRecorder(CallOrder):
             CallsDoNotFit: the calls are not those of the layout.
         """
         self.check(self.where)
-        unknown = self.contributions.unknown() is not None
         if self.whole:
             self.known.learn_sums(self.contributions.sums())
+        else:
+            self.contributions.compare_sums(self.known.sums)
+        unknown = self.contributions.unknown() is not None
         rows_of_sites: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():
             stacked, uniform = (self._stacked(kept[name], recording) for kept in (self._rows, self._uniform))

@@ -24,6 +24,7 @@ from vla_attention.capture.torch_policies.call_tensors import (
     check_change,
     fitted_change,
     normalised,
+    visible,
 )
 from vla_attention.capture.torch_policies.output_ways import used_tensors
 from vla_attention.capture.torch_policies.products import PRODUCTS, Product, find_product, operands_of
@@ -70,7 +71,7 @@ class _Softmax:
     """A softmax whose result has not met values yet.
 
     logits: what it took; before: the same without the watcher's change. change: that one, (batch or 1, head or 1, query
-    or 1, key or 1). kind: what tells it from other softmaxes behind its place. reordered: whether what is followed went
+    or 1, key or 1). reordered: whether what is followed went
     through a function that changes the order of keys, heads or rows. numbers: of this softmax among those of the block,
     and of others in it, as of a mean of two.
     """
@@ -80,7 +81,6 @@ class _Softmax:
     logits: Tensor
     before: Tensor
     change: Tensor | None
-    kind: tuple[Any, ...]
     reordered: bool = False
 
 
@@ -109,10 +109,6 @@ class Softmaxes:
         #: All that met none yet, by their numbers, and the last function of what is followed.
         self.unmet: dict[int, tuple[CallShape, str]] = {}
         self._count = 0
-        #: Those that met values, the kinds of all, and kinds of those that did not meet any before the next one came.
-        self._met: set[int] = set()
-        self._kinds: dict[int, tuple[Any, ...]] = {}
-        self._doubtful: set[tuple[Any, ...]] = set()
         #: Module and number of keys -> the function that selected some of them.
         self._selected: dict[tuple[str, int], str] = {}
 
@@ -127,18 +123,9 @@ class Softmaxes:
             return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
         path, module = self._mode.where()
-
-        def find_out() -> tuple[CallShape, None]:
-            # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
-            batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
-            sizes = (batch, heads, heads, queries, keys)
-            return self._mode.new_shape(path, "softmax", sizes, logits.dtype), None
-
-        kind: tuple[Any, ...] = (path, "softmax", logits.shape, logits.dtype)
-        met = None if self._mode.changes or self.unmet else self._mode.known(("call", *kind))
-        if met is not None and self._mode.passes(structs.replace(met, number=self._mode.number)):
-            return function(*args, **kwargs)  # nothing of it is wanted
-        shape, _ = self._mode.shape_of(kind, find_out)
+        # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
+        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
+        shape = self._mode.new_shape(path, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
         batch, heads = shape.batch, shape.heads
         self._count += 1
         change, given = self._mode.change(shape), logits
@@ -153,17 +140,9 @@ class Softmaxes:
             name = "self" if "self" in kwargs else "input"
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
             self.changed.add(self._count)
-        self._kinds[self._count] = kind
-        if self.unmet:
-            self._doubtful.update(self._kinds[number] for number in (*self.unmet, self._count))
         self.unmet[self._count] = shape, "softmax"
-        self._followed.put(result, _Softmax((self._count,), shape, given.detach(), logits.detach(), change, kind))
+        self._followed.put(result, _Softmax((self._count,), shape, given.detach(), logits.detach(), change))
         return result
-
-    def learn_unmet(self) -> None:
-        """At the end of a block, note which kinds of softmaxes are not always a part of one attention call each."""
-        for kind in {self._kinds[number] for number in self.unmet} | self._doubtful:
-            self._mode.learn(("call", *kind), None)
 
     def select(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a function that selects numbers, which may be scores of keys."""
@@ -282,23 +261,20 @@ class Softmaxes:
                     "all heads and queries alike, or compute the softmax over (batch, head, query, key)."
                 )
             )
-        alone = len(softmax.numbers) == 1 and softmax.numbers[0] not in self._met and softmax.kind not in self._doubtful
-        self._met.update(softmax.numbers)
-        self._mode.learn(("call", *softmax.kind), structs.replace(shape, number=0) if alone else None)
         if self._mode.passes(shape):
             return
         with exact():
-            arrangement = "arrangement", *softmax.kind, letters
-            order = None if self._mode.changes else self._mode.known(arrangement)
-            rows, logits, order, unknown = _decided(multiplied, softmax, given, product, (*sizes, count), order)
-            self._mode.learn(arrangement, order)
+            rows, shown, unknown = _decided(multiplied, softmax, given, product, (*sizes, count))
             values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, count, dim)
             if sinks:
                 left = normalised(_wide(softmax.logits))[..., count:].permute(product.rows)
                 rows = torch.cat([rows, left.reshape(*sizes, sinks)], dim=-1)
                 values = nn.functional.pad(values, (0, 0, 0, sinks))
-            alike = not self._mode.whole and softmax.change is None
-            seen = self._mode.masks.seen_by(rows, logits, sinks, alike=alike)
+            seen = shown if shown.dtype is torch.bool else visible(shown)
+            if seen is None:
+                seen = rows.new_ones((), dtype=torch.bool).expand(sizes[0], 1, sizes[2], keys)
+            elif sinks:
+                seen = nn.functional.pad(seen, (0, sinks), value=True)
         back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
         self._products.put(result, _Made(shape, product.output.index(len(product.rows) - 2)))
         self._mode.saw(
@@ -368,37 +344,35 @@ def _is_changed(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product
         return alike and not bool(rows.reshape(cut.shape).masked_select(cut).any())
 
 
-def _arranged(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[int, Tensor] | None:
-    """Return which way the softmax's axes became those of a product, and its probabilities so; None if in none."""
+def _arranged(
+    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product
+) -> tuple[Callable[[Tensor], Tensor], Tensor] | None:
+    """Return how the softmax's axes became those of a product, and its probabilities so; None where it is not known."""
     expected = normalised(_wide(softmax.logits))
-    for number, arrange in enumerate(_arrangements(expected, given)):
+    for arrange in _arrangements(expected, given):
         arranged = arrange(expected).permute(product.rows)
         if _are_equal(rows, arranged, _rounding(rows, softmax)):
-            return number, arranged
+            return arrange, arranged
     return None
 
 
 def _decided(
-    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product, sizes: tuple[int, ...], order: int | None
-) -> tuple[Tensor, Tensor, int | None, str]:
-    """Return the rows of a product float32, what shows its mask, the arrangement, and why it is refused.
+    rows: Tensor, softmax: _Softmax, given: Tensor, product: Product, sizes: tuple[int, ...]
+) -> tuple[Tensor, Tensor, str]:
+    """Return the rows of a product float32, what shows its mask, and why it is refused.
 
-    The mask shows in the logits, or is (batch, head, query, key) bool, of keys that are seen.
+    The mask shows in logits, or is (batch, head, query, key) bool, of keys that are seen.
 
     rows: the probabilities as they are multiplied, (*lead, query, key). sizes: batch, heads, queries and keys, in which
-    rows and logits are returned. order: the arrangement, if it is known, by its number; None where there is none.
+    rows and logits are returned.
     """
     narrow, rounding = torch.finfo(rows.dtype).bits < 32, _rounding(rows, softmax)
-    arranged: Tensor | None = None
-    if order is None and (found := _arranged(rows, softmax, given, product)) is not None:
-        order, arranged = found
-    if order is not None:
-        arrange = _arrangements(softmax.before, given)[order]
-        if narrow and arranged is None:
-            arranged = arrange(normalised(_wide(softmax.logits))).permute(product.rows)
+    known = _arranged(rows, softmax, given, product)
+    if known is not None:
+        arrange, arranged = known
+        logits = arrange(softmax.before).permute(product.rows).reshape(sizes)
         # Rounded to the compute precision, probabilities would not sum to 1.
-        exact_rows = rows.float() if arranged is None or not narrow else arranged
-        return exact_rows.reshape(sizes), arrange(softmax.before).permute(product.rows).reshape(sizes), order, ""
+        return (arranged if narrow else rows.float()).reshape(sizes), logits, ""
     # Something else is multiplied than what the softmax gave, or its logits were written over: then a key that has any
     # mass is seen. In float16 nothing tells, for keys that are seen may have none.
     expected = normalised(_wide(softmax.logits))
@@ -415,7 +389,7 @@ def _decided(
     seen = torch.ones_like(rows, dtype=torch.bool)
     if not half:
         seen = (rows > 0) & (rows > NO_MASS).any(dim=1, keepdim=True)
-    return rows, seen, None, refused
+    return rows, seen, refused
 
 
 def _arrangements(expected: Tensor, given: Tensor) -> list[Callable[[Tensor], Tensor]]:

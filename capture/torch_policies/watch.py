@@ -19,13 +19,12 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from threading import get_ident
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from msgspec import structs
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
-from torch.utils._device import DeviceContext
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher, exact
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused, Masks
@@ -42,7 +41,6 @@ from vla_attention.schemas.errors import BadArgument, Note, UserError, listing, 
 Handler = Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]
 
 _is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-_Fact = TypeVar("_Fact")
 
 _ACTIVE = threading.Lock()
 _OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
@@ -101,7 +99,7 @@ class AttentionMode(TorchFunctionMode):
         self._ran_elsewhere = False
         self._places = known.places
         #: Whether every function is watched; else in which modules it is off, and how many others are running.
-        self.whole = watcher.whole = known.places.next_is_whole()
+        self.whole = watcher.whole = bool(watcher.changes) or known.places.next_is_whole()
         watcher.number = known.places.calls
         self._quiet: Set[int] = frozenset() if self.whole else known.places.quiet
         self._watched = 0
@@ -315,17 +313,23 @@ class AttentionMode(TorchFunctionMode):
             self._leave_stack()
 
     def _enter_stack(self) -> None:
-        """Go on the stack of function modes: under what the policy put there, and above torch's own default device."""
-        height, place = torch._C._len_torch_function_stack(), 0
-        while place < height and self._stays_below(torch._C._get_function_stack_at(place)):
+        """Go on the stack of function modes: below what the policy put there, which it takes off from the top.
+
+        Lower still are those that were there before the block, and torch's default device, which has to be the lowest.
+        """
+        height, place, before = torch._C._len_torch_function_stack(), 0, list(self._before)
+        default = getattr(torch._GLOBAL_DEVICE_CONTEXT, "device_context", None)
+        while place < height:
+            mode = torch._C._get_function_stack_at(place)
+            if before and mode is before[0]:
+                before.pop(0)
+            elif mode is not default or default is None:
+                break
             place += 1
         above = [torch._C._pop_torch_function_stack() for _ in range(height - place)]
         for mode in (self, *reversed(above)):
             torch._C._push_on_torch_function_stack(mode)
         self._on = True
-
-    def _stays_below(self, mode: object) -> bool:
-        return isinstance(mode, DeviceContext) or any(mode is one for one in self._before)
 
     def _leave_stack(self) -> None:
         """Go off it again, unless something is followed, or torch itself took this mode off to ask it about a function.
@@ -358,38 +362,6 @@ class AttentionMode(TorchFunctionMode):
             self.outputs.entries.clear()
             self._leave_stack()
 
-    @property
-    def changes(self) -> bool:
-        """Whether the watcher is asked for changes."""
-        return bool(self._watcher.changes)
-
-    def known(self, key: tuple[Any, ...]) -> Any:
-        """Return what was the same for all calls of one kind in blocks that were watched throughout; None in those.
-
-        key: what is known, the module's path, and what tells calls apart in it.
-        """
-        return None if self.whole else self._places.facts.get((*key, self._multihead_heads))
-
-    def learn(self, key: tuple[Any, ...], facts: Any) -> None:
-        """Keep what is known of calls of one kind, key as in `known`; facts: None if it is not the same for all."""
-        if self.whole:
-            self._places.learn((*key, self._multihead_heads), facts)
-
-    def shape_of(
-        self, kind: tuple[Any, ...], find_out: Callable[[], tuple[CallShape, _Fact]]
-    ) -> tuple[CallShape, _Fact]:
-        """Return the shape of the call that comes next, and something else that is the same for all such calls.
-
-        kind: the module's path, and what tells calls apart in it. find_out: is asked once for each kind.
-        """
-        key = ("shape", *kind, self._multihead_heads)
-        if key not in self._places.facts:
-            shape, fact = find_out()
-            self._places.facts[key] = structs.replace(shape, number=0), fact
-            return shape, fact
-        shape, fact = self._places.facts[key]
-        return structs.replace(shape, number=self.number), fact
-
     def close(self) -> None:
         """End a block whose code raised nothing; errors: see `watch_attention`, also those that the policy caught."""
         if self._error is not None:
@@ -407,12 +379,11 @@ class AttentionMode(TorchFunctionMode):
                 "it. Open the block in the thread that calls the policy, around that one call, and let no other thread "
                 "call it meanwhile."
             )
-        self._softmaxes.learn_unmet()
         missed = self._places.missed
         found = self._places.passed(self._ran, self._attending, whole=self.whole, number=self.number)
         self._watcher.modules = self._ran | self._places.seen
         if found:
-            paths = listing(sorted(self._paths[number] for number in found))
+            paths = listing(sorted(self._paths[number] or "the policy itself" for number in found))
             warnings.warn(
                 f"The policy computes attention in {paths} now, where it had none in the first policy calls. In "
                 f"{plural(missed, 'block')} before this one no attention was seen, which may have been there, and "

@@ -2,16 +2,17 @@
 
 The first calls are watched throughout, until two in a row computed attention in no new module, and then every
 sixteenth. In the others, a module is watched while it runs if it computed attention before, itself and not in a module
-that it calls, or if it did not run before; and what comes of an attention call is watched, however far it goes.
+that it calls, or if it did not run before; and what comes of an attention call is watched, however far it goes. Calls
+whose attention is changed are all watched throughout: one that is missed would change what the policy does.
 
-Attention that begins in a module that had none is seen in the next call that is watched throughout: after a call in
-which none was seen although other modules ran than in answers from a queue, that is the next one.
+Attention that begins in a module that had none is seen in the next call that is watched throughout. That is the next
+one, after a call that did not fit its layout, or after more blocks without attention in a row than a queue of the
+policy's explains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Set
-from typing import Any
 
 #: Calls in a row without attention in a new module before only known ones are watched, with the first one.
 _SETTLING = 3
@@ -29,8 +30,7 @@ class WatchedPlaces:
             all modules.
         seen: ids of all that ran.
         calls: number of calls with attention.
-        missed: calls since the last one that was watched throughout in which attention may have been missed.
-        facts: what is the same for all attention calls of one kind in a module, or for all softmaxes.
+        missed: blocks since the last call that was watched throughout in which attention may have been missed.
     """
 
     def __init__(self) -> None:
@@ -38,16 +38,19 @@ class WatchedPlaces:
         self.seen: set[int] = set()
         self.calls = 0
         self.missed = 0
-        self.facts: dict[tuple[Any, ...], Any] = {}
-        self._unlike: set[tuple[Any, ...]] = set()
         self._attending: set[int] = set()
-        #: Modules that ran in calls without attention.
-        self._idle: set[int] = set()
         self._settling = _SETTLING
+        #: Blocks without attention in a row: now, and the most between two calls that were watched throughout.
+        self._without = 0
+        self._queue = 0
 
     def next_is_whole(self) -> bool:
         """Return whether the next call is watched throughout."""
         return self._settling > 0 or self.calls % EVERY == 0
+
+    def doubt(self) -> None:
+        """Watch the next call throughout."""
+        self._settling = max(self._settling, 1)
 
     def passed(self, ran: Set[int], attending: Set[int], *, whole: bool, number: int) -> Set[int]:
         """Learn from a call; returns the modules by which it shows that attention was missed before.
@@ -56,25 +59,19 @@ class WatchedPlaces:
         number: of its attention calls.
         """
         if not number:  # the policy answered from a queue, or computes attention where it did not
-            if whole:
-                self._idle |= ran
-            elif not ran <= self._idle:
-                self._settling, self.missed = max(self._settling, 1), self.missed + 1
+            self._without += 1
+            if not whole and self._without > self._queue:
+                self.missed += 1
+                self.doubt()
             return frozenset()
         new = attending - self._attending
         found = new & self.quiet if self.missed else frozenset()
         if whole:
             self._settling, self.missed = (_SETTLING - 1 if new else max(self._settling - 1, 0)), 0
+            self._queue = max(self._queue, self._without) if self.calls and not found else self._queue
+        self._without = 0
         self.calls += 1
         self.seen |= ran
         self._attending |= attending
         self.quiet = frozenset() if OUTSIDE in self._attending else frozenset(self.seen - self._attending)
         return found
-
-    def learn(self, key: tuple[Any, ...], facts: Any) -> None:
-        """Keep what is known of the calls of one kind, unless it is not the same for all of them; None: it is not."""
-        if key in self._unlike:
-            return
-        if facts is None or self.facts.setdefault(key, facts) != facts:
-            self._unlike.add(key)
-            self.facts.pop(key, None)

@@ -15,9 +15,9 @@ from vla_attention.capture.torch_policies.watch import watch_attention
 
 @dataclass
 class Seen(Watcher):
-    """A watcher that takes everything of every call, and changes calls with `changes`."""
+    """A watcher that takes everything of every call, and changes calls with `changes`; None changes nothing."""
 
-    changes: Callable[[CallShape], Tensor | None] = lambda shape: None
+    changes: Callable[[CallShape], Tensor | None] | None = lambda shape: None
     asked: list[CallShape] = field(default_factory=list)
     shapes: list[CallShape] = field(default_factory=list)
     rows: list[Tensor] = field(default_factory=list)
@@ -26,6 +26,7 @@ class Seen(Watcher):
     calls: list[AttentionCall] = field(default_factory=list)
 
     def change(self, shape: CallShape) -> Tensor | None:
+        assert self.changes is not None
         self.asked.append(shape)
         return self.changes(shape)
 
@@ -42,7 +43,7 @@ def first_and_narrow(policy: object, call: Callable[[], Tensor]) -> list[tuple[S
     """Watch a call four times; returns the first, which is watched throughout, and the last, which is not."""
     found, made = find_policy(policy), []
     for _ in range(4):
-        seen = Seen()
+        seen = Seen(changes=None)
         with watch_attention(found, seen):
             made.append((seen, call()))
     assert [seen.whole for seen, _ in made] == [True, True, True, False]

@@ -71,8 +71,8 @@ def sample_variants(model: PiModel, calls: Sequence[ModelCall], num_steps: int, 
     """Return the actions (call, horizon, action dim) float32, still normalised.
 
     What bfloat16 rounds differs from batch to batch by more than small effects. The first call is then made in every
-    batch, and the others are moved by as much as it differs from its first time: a call that is the same gives the same
-    to the bit.
+    batch of calls with as many tokens, and these are moved by as much as it differs from its first time: a call that is
+    the same gives the same to the bit.
 
     num_steps: denoise steps. batch: calls that are made at a time, at most.
     """

@@ -70,11 +70,14 @@ def test_rows_and_results(case):
     hidden = torch.randn(case["batch"], case["queries"], width, generator=generator).to(case["dtype"])
     memory = torch.randn(case["batch"], case["keys"], width, generator=generator).to(case["dtype"])
     expected = policy(hidden, memory, mask)
+    asked = Seen()
+    with watch_attention(policy, asked):
+        policy(hidden, memory, mask)
+    assert asked.asked == asked.shapes
     for seen, result in first_and_narrow(policy, lambda: policy(hidden, memory, mask)):
         assert torch.equal(result, expected)
         assert [shape.module for shape in seen.shapes] == ["layers.0", "layers.1"]
         assert [shape.number for shape in seen.shapes] == [0, 1]
-        assert seen.asked == seen.shapes
         assert max(seen.errors) < TOLERANCE[case["dtype"]]
         for (query, key), rows, allowed, shape in zip(taken[-2:], seen.rows, seen.allowed, seen.shapes, strict=True):
             assert (shape.batch, shape.heads, shape.kv_heads) == (case["batch"], case["heads"], case["kv_heads"])

@@ -19,6 +19,7 @@ from tests.kit.attention_modules import Policy, Seen, first_and_narrow
 from tests.kit.small_torch_policy import SmallPolicy, given
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.torch_policies.attention_calls import Watcher
+from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.watch import AttentionMode, NotFollowed, watch_attention
@@ -75,7 +76,7 @@ def steps():
 
 
 def calls_of(policy, found, changed=""):
-    policy.changed, seen = changed, Seen()
+    policy.changed, seen = changed, Seen(changes=None)
     x = torch.ones(1, 3, 8)
     expected = policy(x)
     with watch_attention(found, seen):
@@ -139,19 +140,62 @@ def test_attention_that_moved_is_missed_once_and_that_is_said(steps):
         assert len(calls_of(policy, found).rows) == 1
 
 
-def test_answers_from_a_queue_teach_nothing():
+def test_answers_from_a_queue_are_no_calls():
     places = WatchedPlaces()
-    for _ in range(10):
-        assert places.next_is_whole()
-        places.passed({7, 8}, set(), whole=True, number=0)
     for call in range(20):
         whole = places.next_is_whole()
+        assert whole is (call < 3 or call % EVERY == 0)
         places.passed({7, 8, 9}, {9}, whole=whole, number=1)
         for _ in range(4):
-            whole = places.next_is_whole()
-            places.passed({7}, {7}, whole=whole, number=0)  # a gate's softmax
-            assert whole is (call < 2 or call % EVERY == EVERY - 1)
-    assert places.calls == 20
+            places.passed({7}, {7}, whole=places.next_is_whole(), number=0)  # with a gate's softmax
+    assert (places.calls, places.missed) == (20, 0)
+    places.passed({7, 8, 9}, set(), whole=False, number=0)  # one more than the queue explains
+    assert (places.next_is_whole(), places.missed) == (True, 1)
+
+
+class Moving(nn.Module):
+    """Answers five calls from one chunk, whose attention is in a module of its own for five chunks only."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.kernel, self.chunks, self.queue = Kernel(), 0, []
+        self.out = nn.Parameter(torch.randn(16, 2))
+        self.tokens, self.keys = nn.Parameter(torch.randn(1, 2, 5, 8)), nn.Parameter(torch.randn(1, 2, 4, 8))
+
+    @torch.no_grad()
+    def forward(self) -> Tensor:
+        if not self.queue:
+            self.chunks += 1
+            mixed = (self.kernel if self.chunks <= 5 else sdpa)(self.tokens, self.keys, self.keys)
+            self.queue = list((mixed.transpose(1, 2).flatten(2) @ self.out)[0])
+        return self.queue.pop(0)
+
+
+class Kernel(nn.Module):
+    def forward(self, *given: Tensor) -> Tensor:
+        return sdpa(*given)
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_queue_hides_no_attention_that_moved(tmp_path, hidden):
+    """One chunk is missed, and a note says so; where attention is changed, none is."""
+    policy = Moving().eval()
+    changes = {"interventions": va.knockout("role:state")} if hidden else {}
+    layout = text_and_state()
+    run = va.record(tmp_path / "a.zarr", policy, layout=layout, contributions=False, durable=False, **changes)
+    chunks = []
+    with (
+        nullcontext() if hidden else pytest.warns(Note, match="attention in .*now.*1 block"),
+        run,
+        run.episode(task_id=0, episode_index=0, instruction="a") as episode,
+    ):
+        for step in range(60):
+            with episode.replan(env_step=step) as replan:
+                replan.actions = policy()
+            chunks.append(replan.actions.tolist())
+    assert (policy.chunks, episode.num_replans) == (12, 12 if hidden else 11)
+    assert len({str(chunks[5 * number : 5 * number + 5]) for number in range(12)}) == 1
 
 
 def test_a_new_module_begins_anew():
@@ -165,6 +209,14 @@ def test_a_new_module_begins_anew():
     for call in range(4):
         places.passed({1, 2}, {1, 2} if call else {1}, whole=places.next_is_whole(), number=1)
     assert places.quiet == set()
+
+
+def text_and_state() -> va.PolicyLayout:
+    """The layout of a policy with one attention call, of five queries over two keys of text and two of the state."""
+    keys = SiteLayout("text", (Span("prompt", "text", 0, 2), Span("state", "state", 2, 4)))
+    site = va.RecordedSite(keys, (0, 5), {"prompt": "text", "state": "state"})
+    rule = va.CallRule(".*", None, sequence=(("text", 0),))
+    return va.PolicyLayout("tiny", "tiny", (site,), (rule,), 1, 2, 1, denoise_times=(1.0,))
 
 
 class Cached(nn.Module):
@@ -193,11 +245,7 @@ class Cached(nn.Module):
 @pytest.mark.parametrize("hidden", [False, True])
 def test_every_call_of_a_policy_with_queue_and_cache_is_recorded_and_changed(tmp_path, hidden):
     policy = Cached().eval()
-    keys = SiteLayout("text", (Span("prompt", "text", 0, 2), Span("state", "state", 2, 4)))
-    site = va.RecordedSite(keys, (0, 5), {"prompt": "text", "state": "state"})
-    layout = va.PolicyLayout(
-        "tiny", "tiny", (site,), (va.CallRule(".*", None, sequence=(("text", 0),)),), 1, 2, 1, denoise_times=(1.0,)
-    )
+    layout = text_and_state()
     changes = {"interventions": va.knockout("role:state")} if hidden else {}
     run = va.record(tmp_path / "a.zarr", policy, layout=layout, contributions=False, durable=False, **changes)
     actions = []
@@ -232,15 +280,52 @@ def test_who_computes_attention_is_asked_at_every_call():
     policy = Trunk()
     found = find_policy(policy)
     for name in ("arm", "arm", "arm", "hand", "arm"):
-        seen = Seen()
+        seen = Seen(changes=None)
         with torch.no_grad(), watch_attention(found, seen):
             policy(torch.ones(1, 2, 3, 8), name)
         assert [shape.module for shape in seen.shapes] == [name]
 
 
+class OnDevice(nn.Module):
+    """Attention inside of a context of the policy's own, which it goes on after."""
+
+    def __init__(self, context) -> None:
+        super().__init__()
+        self.attend, self.context = Attend(), context
+
+    @torch.no_grad()
+    def forward(self, x: Tensor) -> Tensor:
+        with self.context:
+            x = x + self.attend(x)
+        return x + torch.zeros(1)
+
+
+class Keeping(Seen):
+    """Follows what the attention gave until the end."""
+
+    def saw(self, call):
+        super().saw(call)
+        return OutputWay(lambda *_: (None, True))
+
+
+@pytest.mark.parametrize(("context", "around"), [(torch.device("meta"), False), (OwnMode(), False), (OwnMode(), True)])
+def test_contexts_of_the_policy_are_as_they_were(context, around):
+    policy, x = OnDevice(context), torch.ones(1, 3, 8)
+    found = find_policy(policy)
+    with context if around else nullcontext():
+        modes = torch._C._len_torch_function_stack()
+        for _ in range(5):
+            keeping = Keeping(changes=None)
+            with watch_attention(found, keeping):
+                policy(x)
+            assert len(keeping.rows) == 1
+            assert torch._C._len_torch_function_stack() == modes
+    assert torch.zeros(1).device.type == "cpu"
+
+
 def test_a_default_device_that_the_policy_sets_stays_and_nothing_else(steps):
     policy, found = steps
-    seen = Seen()
+    seen = Seen(changes=None)
     try:
         for _ in range(5):
             with watch_attention(found, seen):
@@ -388,9 +473,9 @@ def test_modules_in_another_order_are_seen_as_themselves():
     policy = Policy(sdpa, layers=3).eval().requires_grad_(False)
     found, hidden = find_policy(policy), torch.randn(1, 5, 32)
     for _ in range(3):
-        with watch_attention(found, Seen()):
+        with watch_attention(found, Seen(changes=None)):
             policy(hidden, hidden)
-    wanted, seen, layers = {}, Seen(), list(policy.layers)
+    wanted, seen, layers = {}, Seen(changes=None), list(policy.layers)
     with watch_attention(found, seen):
         for number in (2, 0, 1):
             wanted[f"layers.{number}"] = hidden
