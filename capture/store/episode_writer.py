@@ -19,7 +19,6 @@ from vla_attention.capture.store.replan_records import (
     CHUNK_AXES,
     EpisodeStart,
     RecordedSteps,
-    ReplanEffects,
     ReplanRecord,
 )
 from vla_attention.capture.store.site_writer import SiteWriter
@@ -187,17 +186,13 @@ class EpisodeWriter:
         """The facts of a replan alone; conditions of effects are those of the replans before it."""
         effects = record.effects
         if effects is not None:
-            before = self._earlier_effects or effects
+            before = (self.records[0].effects if self.records else None) or effects
             empty = np.zeros((0, 0, 0), dtype=np.float32)
             effects = replace(effects, conditions=before.conditions, items=before.items, change=empty, cut={})
         return replace(
             record, rows={}, key_role={}, state=None, actions=None, frames={}, camera_frames={}, coverage={},
             dataset_actions=None, base_actions=None, effects=effects,
         )  # fmt: skip
-
-    @property
-    def _earlier_effects(self) -> ReplanEffects | None:
-        return next((one.effects for one in self.records if one.effects is not None), None)
 
     def _problems(self, record: ReplanRecord) -> Iterator[str]:
         """What forbids adding a replan. The first sentence counts: later ones may rest on what it says is broken."""
@@ -255,7 +250,7 @@ class EpisodeWriter:
         wanted = planned is not None and len(self.records) % planned.every == 0
         if wanted is not (effects is not None):
             yield f"it has {'no ' if wanted else ''}effects, other than the run says"
-        earlier = self._earlier_effects
+        earlier = first.effects  # a run that measures effects does so at the first replan
         if effects and earlier and (effects.conditions, effects.units) != (earlier.conditions, earlier.units):
             yield "its effects are of other conditions, or in other units, than those of the replans before it"
 

@@ -154,19 +154,6 @@ def part(tensor: Tensor, queries: slice, batch: slice) -> Tensor:
     return tensor[batch if tensor.shape[0] > 1 else slice(None), :, queries if tensor.shape[2] > 1 else slice(None)]
 
 
-def changed_mask(mask: Tensor | None, causal: bool, change: Tensor, queries: int, keys: int) -> tuple[Tensor, Tensor]:
-    """Return the policy's mask and the changed one as float32 logits, (batch or 1, head or 1, query, key)."""
-    before = torch.zeros((1, 1, queries, keys), device=change.device)
-    if mask is not None and mask.dtype is torch.bool:
-        before = before.masked_fill(~mask, float("-inf"))
-    elif mask is not None:
-        before = before + mask.to(torch.float32)
-    if causal:
-        seen = causal_mask(torch.arange(queries, device=change.device), keys)
-        before = before.masked_fill(~seen, float("-inf"))
-    return before, before + change
-
-
 def batch_and_heads(lead: Sequence[int], module: nn.Module | None) -> tuple[int, int]:
     """Return (batch, heads) of the axes before query and dim (or before query and key).
 

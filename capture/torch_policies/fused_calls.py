@@ -7,6 +7,7 @@ Run eager, it applies the mask function to every key, whatever the blocks say.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,6 @@ from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_tensors import (
     SeenKeys,
     batch_and_heads,
-    changed_mask,
     check_change,
     fitted_change,
     normalised,
@@ -66,7 +66,6 @@ def watch_sdpa(
     mode.refuse_without_numbers(query, key)
     if isinstance(given.attn_mask, CausalBias):  # it has no numbers of its own
         given = structs.replace(given, attn_mask=given.attn_mask._materialize(query.device))
-
     device = query.device.type
     dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else query.dtype
     path, module = mode.where()
@@ -79,6 +78,7 @@ def watch_sdpa(
     batch, heads, queries, keys = shape.batch, shape.heads, shape.queries, shape.keys
     kernel_queries, dim = query.shape[-2], query.shape[-1]
 
+    @cache
     def folded_mask() -> Tensor | None:
         if given.attn_mask is None:
             return None
@@ -87,12 +87,19 @@ def watch_sdpa(
             mask = mask.expand(-1, kernel_heads, kernel_queries, -1).reshape(-1, heads, queries, mask.shape[-1])
         return mask
 
+    def seen_of(wanted: slice, rows: slice) -> SeenKeys:
+        mask, size = folded_mask(), len(range(*rows.indices(batch)))
+        given_mask = None if mask is None else part(mask, wanted, rows)
+        return mode.masks.seen(given_mask, given.is_causal, wanted, (size, queries, keys), query.device)
+
     change = mode.change(shape)
     if change is None:
         output = function(*args, **kwargs)
     else:
         change = fitted_change(change, shape, query.device)
-        before, after = changed_mask(folded_mask(), given.is_causal, change, queries, keys)
+        before, added = torch.zeros((1, 1, queries, keys), device=query.device), seen_of(slice(None), slice(None)).added
+        before = before if added is None else before + added.float()
+        after = before + change
         check_change(before, after, shape)
         # As the kernel wants it: as many axes as its queries have.
         logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(dtype)
@@ -101,16 +108,11 @@ def watch_sdpa(
             output = function(query, key, given.value, logits, given.dropout_p, **options)
     if mode.passes(shape):
         return output
-    mask = folded_mask()
     folded_query = query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim)
     folded_key, values = (
         _folded(tensor.to(dtype), lead, batch, shape.kv_heads) for tensor in (key, given.value)
     )  # fmt: skip
     scale = dim**-0.5 if given.scale is None else given.scale
-
-    def seen_of(wanted: slice, rows: slice) -> SeenKeys:
-        given_mask, size = None if mask is None else part(mask, wanted, rows), len(range(*rows.indices(batch)))
-        return mode.masks.seen(given_mask, given.is_causal, wanted, (size, queries, keys), query.device)
 
     def rows_of(wanted: slice, rows: slice) -> Tensor:
         logits, seen = query_key_logits(folded_query[rows, :, wanted], folded_key[rows], scale), seen_of(wanted, rows)

@@ -42,8 +42,6 @@ class ReplanContributions:
         self._parts: dict[tuple[str, int], tuple[NDArray[np.uint8], NDArray[np.bool_]]] = {}
         #: By the same, and the site's keys that a call has: the keys of each part.
         self._keys: dict[tuple[str, int, bytes], list[slice | Tensor]] = {}
-        #: By site and block: the number of the sum that is the stream, where it is known from other calls.
-        self.expected: Mapping[tuple[str, int], int] = {}
         self._ways: defaultdict[tuple[str, Cell], list[OutputWay]] = defaultdict(list)
         self._places: list[tuple[CallPlace, OutputWay]] = []
 
@@ -59,12 +57,13 @@ class ReplanContributions:
         return grams
 
     def way(
-        self, call: AttentionCall, rows: Tensor, place: CallPlace, site: RecordedSite, cell: Cell, *, by_part: bool
-    ) -> OutputWay:
+        self, call: AttentionCall, rows: Tensor, place: CallPlace, site: RecordedSite, cell: Cell, *, by_part: bool,
+        expected: int | None,
+    ) -> OutputWay:  # fmt: skip
         """Follow the output of a call.
 
-        rows: (batch, head, query, key) of its keys. by_part: for the contributions of each
-        part; else all keys are one part, which is enough to tell whether the rows of a batch are apart.
+        rows: (batch, head, query, key) of its keys. by_part: for the contributions of each part; else all keys are one
+        part, which is enough to tell whether the rows of a batch are apart. expected: as of `OutputWay`.
         """
         mixed = []
         for row in self._rows:
@@ -86,7 +85,7 @@ class ReplanContributions:
             found = self._projected(call, mixed, place.queries, by, added, way.dtypes)
             return found or self._added(call, mixed, place.queries, replay, added, way.dtypes)
 
-        way = OutputWay(take, self.expected.get((site.name, place.block)))
+        way = OutputWay(take, expected)
         self._ways[site.name, cell].append(way)
         self._places.append((place, way))
         return way

@@ -180,11 +180,12 @@ class ReplanRecorder(CallOrder):
             self.problems[f"of a call of site '{site.name}', {problem}"] = None
         rows = torch.threshold(rows, NO_MASS, 0.0)
         way, by_part = None, recording.contributions
-        self.contributions.expected = {} if self.whole or self._is_sample(place.block, site.name) else self.known.sums
         asks_of_axes = self.asks_of_axes and call.heads_may_be_queries
         if by_part or self.asks_of_batch or asks_of_axes:
             self.asks_of_batch, self.asks_of_axes = False, self.asks_of_axes and not asks_of_axes
-            way = self.contributions.way(call, rows, place, site, cell, by_part=by_part)
+            looked_at = self.whole or self._is_sample(place.block, site.name)
+            expected = None if looked_at else self.known.sums.get((site.name, place.block))
+            way = self.contributions.way(call, rows, place, site, cell, by_part=by_part, expected=expected)
         chosen = self._chosen(rows, place, site)
         large = chosen.numel() > _LARGE_COPY
         self._rows[site.name][cell].append(chosen.cpu() if large else chosen)

@@ -58,9 +58,8 @@ class CompiledSteps:
     def __init__(self, model: PiModel, backend: str = "inductor") -> None:
         self._model = model
         # On a GPU the kernels of a step are replayed as one CUDA graph.
-        options: dict[str, Any] = {"mode": "reduce-overhead"} if model.device.type == "cuda" else {}
-        if backend != "inductor":
-            options = {}
+        replayed = backend == "inductor" and model.device.type == "cuda"
+        options: dict[str, Any] = {"mode": "reduce-overhead"} if replayed else {}
         self._graph = torch.compile(self._step, backend=backend, dynamic=False, fullgraph=True, **options)
 
     def _step(

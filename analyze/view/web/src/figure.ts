@@ -1,7 +1,7 @@
 /** The pictures of a call as a figure of its own, drawn from what is shown and not from how a browser shows it. */
 import { address } from "./answers";
 import { levels, type Kind, linesOf, meaning, STROKES } from "./pictures";
-import { denoise, head, layer, nameInRun, runs, type Side, sides, site } from "./state";
+import { denoise, fullNameOf, head, layer, type Side, sides, site } from "./state";
 import { outline } from "./sums";
 
 /** Pixels: the width of a picture, between things, of a line of text, and of a letter of it, about. */
@@ -43,12 +43,12 @@ interface Drawn {
 }
 
 /** One episode: whose it is, what it came to, the step, and its pictures with their lines. */
-async function drawnSide({ scene, at }: Side): Promise<Drawn> {
+async function drawnSide(side: Side): Promise<Drawn> {
+  const { scene, at } = side;
   const episode = scene.about.value.value!;
   const cameras = Object.entries(scene.layout.value?.cameras ?? {});
   const width = Math.max(PICTURE, cameras.length * (PICTURE + GAP) - GAP);
-  const name = `${runs.value.value?.runs[scene.run.value]?.name}, task ${episode.task}, ${nameInRun(episode)}`;
-  const heads = [...wrapped(name, 0.9 * width).map((line) => [line, true] as const), ...wrapped(episode.verdict, width).map((line) => [line, false] as const), [`step ${episode.starts[at]} of ${episode.end}, call ${at} (0 to ${episode.starts.length - 1})`, false] as const];
+  const heads = [...wrapped(fullNameOf(side), 0.9 * width).map((line) => [line, true] as const), ...wrapped(episode.verdict, width).map((line) => [line, false] as const), [`step ${episode.starts[at]} of ${episode.end}, call ${at} (0 to ${episode.starts.length - 1})`, false] as const];
   const texts = heads.map(([line, bold], i) => written(line, 0, (i + 1) * LINE - 4, bold));
   const top = heads.length * LINE + 4;
   let high = 0;

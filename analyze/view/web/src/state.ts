@@ -276,11 +276,14 @@ export const sides = computed<readonly Side[]>(() => [{ scene: main, at: replan.
 /** In an exchange an episode is known by what it was told, and where. */
 export const nameInRun = (line: EpisodeLine): string => (line.scene == null ? `episode ${line.episode}` : `told '${line.told}', scene ${line.scene}`);
 
-/** As "told.zarr, task 1, episode 3"; empty where one episode is shown alone. */
-export function nameOf({ scene }: Side): string {
+/** As "told.zarr, task 1, episode 3". */
+export function fullNameOf({ scene }: Side): string {
   const line = scene.about.value.value;
-  return sides.value.length > 1 && line ? `${runs.value.value?.runs[scene.run.value]?.name}, task ${line.task}, ${nameInRun(line)}` : "";
+  return line ? `${runs.value.value?.runs[scene.run.value]?.name}, task ${line.task}, ${nameInRun(line)}` : "";
 }
+
+/** The same where two episodes are shown; empty where there is one alone. */
+export const nameOf = (side: Side): string => (sides.value.length > 1 ? fullNameOf(side) : "");
 
 export function wordsOf({ scene, at }: Side): readonly Word[] {
   const prompts = scene.layout.value?.prompts ?? [];
