@@ -161,7 +161,7 @@ VIEWER := analyze/view/web
 viewer:
 	@command -v npm >/dev/null || { echo "make viewer needs node (18.18 or later) and npm." >&2; exit 2; }
 	cmp -s $(VIEWER)/package-lock.json $(VIEWER)/node_modules/.installed || { cd $(VIEWER) && npm ci --ignore-scripts --no-audit --no-fund && cp package-lock.json node_modules/.installed; }
-	cd $(VIEWER) && npm run --silent check && npm run --silent build
+	cd $(VIEWER) && npm run --silent check && npm run --silent test && npm run --silent build
 
 setup: .venv/capture-installed
 

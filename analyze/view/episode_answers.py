@@ -22,7 +22,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.ask import answer_to
-from vla_attention.analyze.core.action_changes import GRIPPER, ActionUnits
+from vla_attention.analyze.core.action_changes import EFFECT, GRIPPER, ActionUnits
 from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
@@ -58,6 +58,9 @@ _FEWEST_CLOSED = 3
 MEAN = "mean"
 
 
+#: What fills a word with colour: centimetres by which the hand ends elsewhere, degrees by which it is turned, the part
+#: of the steps in which the gripper's command flips.
+_FULL = {EFFECT: 5.0, "turn": 45.0, "gripper": 0.5}
 #: What names of groups cannot have.
 _IN_NAMES = re.compile(r"[^A-Za-z0-9_]+")
 
@@ -368,26 +371,32 @@ class ShownEpisode:
     def effects(self, units: ActionUnits) -> dict[str, Any] | None:
         """`effects.json`: the numbers of `vla-attention effects` for one episode, item by item; None without any.
 
-        units: of the whole store. effect: the first of their parts at each replan, null where it was not measured;
-        mean: over these; further: that of the other parts.
+        units: of the whole store. effect: (part, replan) in their parts, null where it was not measured; mean: (part)
+        over these. full: what fills a word with colour; null: the largest one of the episode.
         """
         found = recorded_effects(self.question(self._site_names[0]), units=units)
         if found is None:
             return None
-        rows, replans = found.rows().collect(), range(self.episode.attributes.num_replans)
+        rows, num_replans = found.rows().collect(), self.episode.attributes.num_replans
         stored = self.episode.attributes.effects
         assert stored is not None
         numbers = {visible(condition.name): i for i, condition in enumerate(stored.conditions)}
         items = []
         for mean in found.episodes().iter_rows(named=True):
-            effects = dict(rows.filter(condition=mean["condition"]).select("replan", "effect").iter_rows())
+            values = np.full((len(units.parts), num_replans), np.nan)
+            of_item = rows.filter(condition=mean["condition"])
+            values[:, of_item["replan"].to_numpy()] = of_item.select(units.names).to_numpy().T
             items.append(
                 {name: mean[name] for name in (*NAMES, "noise", "lift")}
-                | {"further": [mean[name] for name in units.names[1:]]}
-                | {"number": numbers[mean["condition"]], "mean": mean["effect"], "effect": [*map(effects.get, replans)]}
+                | {"number": numbers[mean["condition"]], "mean": [mean[name] for name in units.names]}
+                | {"effect": _numbers(values, exact=True)}
             )
-        parts = [{"name": part.name, "title": part.title, "share": part.how == "opposite"} for part in units.parts]
-        return {"parts": parts, "said": units.said("{}"), "items": items, "notes": list(found.notes)}
+        parts = [
+            {"name": part.name, "title": part.title, "said": part.said, "share": part.how == "opposite"}
+            | {"full": None if part.how == "mean" else _FULL[part.name]}
+            for part in units.parts
+        ]
+        return {"parts": parts, "items": items, "notes": list(found.notes)}
 
     @property
     def drawn_effects(self) -> list[int]:

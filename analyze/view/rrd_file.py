@@ -219,7 +219,7 @@ def shown_effects(shown: ShownEpisode, units: ActionUnits) -> list[dict[str, Any
     readers = {item["reader"] for item in items}
     reader = "total" if "total" in readers else "direct"
     return [
-        item
+        item | {"effect": item["effect"][0]}
         for item in items
         if item["kind"] in ("without", "prompt", "image", "noise") and item["reader"] in (None, reader)
     ]

@@ -1,7 +1,7 @@
 // Builds the page: `node build.mjs [FOLDER]` writes index.html, main.js, main.css, licenses.txt and build.json into FOLDER
 // (default: ../bundle). The same sources give the same bytes.
 import { createHash } from "node:crypto";
-import { mkdir, readFile, readdir, rm, writeFile } from "node:fs/promises";
+import { mkdir, readdir, readFile, rm, writeFile } from "node:fs/promises";
 import { dirname, join, relative, resolve, sep } from "node:path";
 import { fileURLToPath } from "node:url";
 import { build } from "esbuild";
@@ -33,9 +33,21 @@ async function licenses(inputs) {
 
 const folder = process.argv[2] ? resolve(process.argv[2]) : join(HERE, "../bundle");
 const { outputFiles, metafile } = await build({
-  absWorkingDir: HERE, entryPoints: { main: "src/main.tsx" }, outdir: "out", bundle: true, minify: true, format: "esm",
-  target: "es2022", charset: "utf8", legalComments: "none", jsx: "automatic", jsxImportSource: "preact", platform: "browser",
-  metafile: true, write: false, logLevel: "warning",
+  absWorkingDir: HERE,
+  entryPoints: { main: "src/main.tsx" },
+  outdir: "out",
+  bundle: true,
+  minify: true,
+  format: "esm",
+  target: "es2022",
+  charset: "utf8",
+  legalComments: "none",
+  jsx: "automatic",
+  jsxImportSource: "preact",
+  platform: "browser",
+  metafile: true,
+  write: false,
+  logLevel: "warning",
 });
 const files = new Map(outputFiles.map((file) => [file.path.split(sep).at(-1), Buffer.from(file.contents)]));
 files.set("index.html", await readFile(join(HERE, "src/index.html")));

@@ -193,14 +193,14 @@ def test_effects_are_those_of_the_command(server, places):
     table = va.open(places["effects"]).effects()["effects_episodes"].filter(task_id=0, episode_index=0)
     expected = {row["condition"]: row for row in table.iter_rows(named=True)}
     assert {one["condition"] for one in given} == set(expected)
+    parts = [part["name"] for part in read(server, "effects", "effects.json")["parts"]]
     for one in given:
         row = expected[one["condition"]]
-        for mine, theirs in (("mean", "effect"), ("lift", "lift"), ("noise", "noise")):
-            assert (one[mine] is None) == (row[theirs] is None)
-            assert one[mine] is None or one[mine] == pytest.approx(row[theirs], rel=1e-6)
-        assert (one["label"], one["reader"]) == (row["label"], row["reader"])
-        of_replans = [value for value in one["effect"] if value is not None]
-        assert np.mean(of_replans) == pytest.approx(one["mean"], rel=1e-9)
+        assert (one["label"], one["reader"], one["lift"]) == (row["label"], row["reader"], row["lift"])
+        assert one["noise"] == row["noise"]
+        for part, mean, values in zip(parts, one["mean"], one["effect"], strict=True):
+            assert mean == pytest.approx(row[part], rel=1e-6)
+            assert np.mean([value for value in values if value is not None]) == pytest.approx(mean, rel=1e-9)
     episode = open_store(places["effects"]).episodes[0]
     changed = read(server, "effects", f"actions/{given[0]['number']}.npy")
     assert changed.shape == episode.read("actions").shape

@@ -19,6 +19,7 @@ import vla_attention as va
 from tests.kit.browser import Watched, needs_chromium, watched_page
 from tests.kit.golden_stores import golden_store
 from tests.kit.http_ranges import serve
+from tests.kit.planted_effects import planted_effects
 from tests.kit.stores import StoreSpec, rerun_source, write_store
 from tests.kit.viewer import ask, served
 from vla_attention.analyze.__main__ import main
@@ -143,6 +144,35 @@ def test_an_item_of_the_effects_is_taken_away_by_a_click_or_a_key(browser):
         word.click()
         watched.wait_for_link("group=words")
         assert f"without '{word.inner_text()}'" in watched.page.inner_text(".actions")
+
+
+def shading(watched: Watched) -> dict[str, tuple[float, float]]:
+    """By word the strength of its colour, and of the line below."""
+    style = "(words, name) => words.map((one) => [one.innerText, Number(one.style.getPropertyValue(name))])"
+    colours, lines = (
+        dict(watched.page.locator(".word").evaluate_all(style, name)) for name in ("--strength", "--line")
+    )
+    return {text: (colours[text], lines[text]) for text in colours}
+
+
+def test_words_are_coloured_by_what_an_exchange_does(browser, tmp_path):
+    silent, spoken = "put", "the"
+
+    def scale(name: str, *_: int) -> float:
+        return {f"exchange_word_{silent}": 0.0, f"without_word_{spoken}_queries_all": 0.0}.get(name, 1.0)
+
+    plant = planted_effects(scale, exchanged=True)
+    planted = write_store(tmp_path / "exchanged.zarr", spec=StoreSpec(tasks=(0,), replans=2, plant_effects=plant))
+    with served(planted) as running, watched_page(browser) as watched:
+        watched.open(f"{running.link}{FIRST}&group=words:0")
+        found = shading(watched)
+        assert found[silent][0] == 0 < found[silent][1]  # left out it does something, exchanged it does not
+        assert found[spoken][0] > 0 == found[spoken][1]
+        said = watched.page.inner_text(".about-words")
+        assert f"'{silent}' as" in said
+        assert f"'{silent}' left out" in said
+        parts = json.loads(ask(running, "runs/0/task000_episode000/effects.json").body)["parts"]
+        assert all(part["title"] in said for part in parts)
 
 
 def test_both_episodes_have_heads_and_the_own_group(view, server, store):

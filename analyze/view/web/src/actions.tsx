@@ -1,13 +1,13 @@
 /** The actions of this call, and beside them those of the call without what was taken away. */
 import { address, type Grid, type NumberArray, readArray } from "./answers";
-import { described } from "./effects";
-import { about, answered, beside, besideReplan, episodeName, part, replan, runNumber, taken } from "./state";
+import { described, taken } from "./effects";
+import { about, answered, beside, besideReplan, episodeName, part, replan, runNumber } from "./state";
 import { range } from "./sums";
 
 const NAMES = ["x", "y", "z", "turn x", "turn y", "turn z", "gripper"];
 
-const changed = answered<NumberArray>(() =>
-  taken.value && readArray(`${address.episode(runNumber.value, episodeName.value)}/actions/${taken.value.number}.npy`),
+const changed = answered<NumberArray>(
+  () => taken.value && readArray(`${address.episode(runNumber.value, episodeName.value)}/actions/${taken.value.number}.npy`),
 );
 
 function chunkAt({ shape, data }: NumberArray, at: number): number[][] {
@@ -16,8 +16,15 @@ function chunkAt({ shape, data }: NumberArray, at: number): number[][] {
 }
 
 function path(values: readonly (number | null | undefined)[], low: number, high: number): string {
-  const points = values.map((one, i) => (one == null || Number.isNaN(one) ? null : `${((100 * i) / Math.max(1, values.length - 1)).toFixed(1)} ${(38 - (36 * (one - low)) / (high - low)).toFixed(1)}`));
-  return points.reduce<string>((text, point, i) => (point === null ? text : `${text}${i && points[i - 1] !== null ? "L" : "M"}${point}`), "");
+  const points = values.map((one, i) =>
+    one == null || Number.isNaN(one)
+      ? null
+      : `${((100 * i) / Math.max(1, values.length - 1)).toFixed(1)} ${(38 - (36 * (one - low)) / (high - low)).toFixed(1)}`,
+  );
+  return points.reduce<string>(
+    (text, point, i) => (point === null ? text : `${text}${i && points[i - 1] !== null ? "L" : "M"}${point}`),
+    "",
+  );
 }
 
 export function Actions() {
@@ -32,14 +39,41 @@ export function Actions() {
   return (
     <section class="actions" aria-label="Actions of this call">
       <h2>Actions of this call</h2>
-      <p class="soft">{chunk.length} steps, scale ±{Number(most.toPrecision(2))}{other ? <>; <span class="without">dashed: {whose}</span></> : part("without") && about.value.value?.effects ? `; no call without ${part("without")} was recorded` : ""}</p>
+      <p class="soft">
+        {chunk.length} steps, scale ±{Number(most.toPrecision(2))}
+        {other ? (
+          <>
+            ; <span class="without">dashed: {whose}</span>
+          </>
+        ) : part("without") && about.value.value?.effects ? (
+          `; no call without ${part("without")} was recorded`
+        ) : (
+          ""
+        )}
+      </p>
       <div class="small-plots">
         {range(size).map((i) => (
           <figure key={i}>
             <svg viewBox="0 0 100 40" preserveAspectRatio="none" role="img" aria-label={size === 7 ? NAMES[i] : `dimension ${i}`}>
               <path class="zero" d="M0 20H100" />
-              <path class="chunk" d={path(chunk.map((line) => line[i]), -most, most)} />
-              {other ? <path class="chunk without" d={path(other.map((line) => line[i]), -most, most)} /> : null}
+              <path
+                class="chunk"
+                d={path(
+                  chunk.map((line) => line[i]),
+                  -most,
+                  most,
+                )}
+              />
+              {other ? (
+                <path
+                  class="chunk without"
+                  d={path(
+                    other.map((line) => line[i]),
+                    -most,
+                    most,
+                  )}
+                />
+              ) : null}
             </svg>
             <figcaption>{size === 7 ? NAMES[i] : i}</figcaption>
           </figure>

@@ -156,31 +156,34 @@ export interface Effect {
   readonly kind: string;
   readonly item: string;
   readonly item_kind: string;
+  /** What stands in its place. */
+  readonly instead: string;
   /** How sentences call it. */
   readonly label: string;
   readonly selector: string | null;
   readonly reader: string | null;
-  readonly effect: readonly (number | null)[];
-  readonly mean: number | null;
-  /** Means of the parts behind the first. */
-  readonly further: readonly (number | null)[];
-  /** Another noise seed's effect. */
+  /** (part, replan), and means over the replans. */
+  readonly effect: Grid;
+  readonly mean: readonly (number | null)[];
+  /** Another noise seed's effect, of the first part. */
   readonly noise: number | null;
   readonly lift: number | null;
 }
 
-/** What an effect is told by: the first part is `effect` and `mean` of an item, the others are `further`. */
+/** What an effect is told by. */
 export interface EffectPart {
   readonly name: string;
   readonly title: string;
+  /** How a sentence has a number of it: "the hand ends {} cm elsewhere". */
+  readonly said: string;
   /** Whether it is a share of the steps. */
   readonly share: boolean;
+  /** What fills a word with colour; null: the largest of the episode. */
+  readonly full: number | null;
 }
 
 export interface Effects {
   readonly parts: readonly EffectPart[];
-  /** How a sentence has a number of the first part: "the hand ends {} cm elsewhere". */
-  readonly said: string;
   readonly items: readonly Effect[];
   readonly notes: readonly string[];
 }
@@ -223,7 +226,11 @@ async function answerTo(address: string): Promise<Response> {
     return reply;
   } catch {
     serverGone.value = true;
-    throw new Error(isFolder ? `Nobody answers for ${address}.` : "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.");
+    throw new Error(
+      isFolder
+        ? `Nobody answers for ${address}.`
+        : "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.",
+    );
   }
 }
 
@@ -296,7 +303,13 @@ export function parseNpy(bytes: ArrayBuffer): NumberArray {
   const shape = /'shape': \(([^)]*)\)/.exec(header)?.[1];
   if (shape === undefined || !header.includes("'<f4'")) throw new Error("An array came in another format than this page reads.");
   const data = new Float32Array(bytes.slice(10 + length));
-  return { shape: shape.split(",").filter((part) => part.trim()).map(Number), data };
+  return {
+    shape: shape
+      .split(",")
+      .filter((part) => part.trim())
+      .map(Number),
+    data,
+  };
 }
 
 export const address = {

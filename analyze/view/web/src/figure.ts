@@ -1,16 +1,16 @@
 /** The pictures of a call as a figure of its own, drawn from what is shown and not from how a browser shows it. */
 import { address } from "./answers";
-import { levels, type Kind, linesOf, meaning, STROKES } from "./pictures";
+import { type Kind, levels, linesOf, meaning, STROKES } from "./pictures";
 import { denoise, fullNameOf, head, layer, type Side, sides, site } from "./state";
 import { outline } from "./sums";
 
 /** Pixels: the width of a picture, between things, of a line of text, and of a letter of it, about. */
 const [PICTURE, GAP, LINE, LETTER] = [320, 12, 18, 6.9];
 
-const escaped = (text: string): string => text.replace(/[&<>"]/g, (letter) => `&#${letter.charCodeAt(0)};`);
+export const escaped = (text: string): string => text.replace(/[&<>"]/g, (letter) => `&#${letter.charCodeAt(0)};`);
 
 /** Words in lines of so many pixels. */
-function wrapped(text: string, width: number): string[] {
+export function wrapped(text: string, width: number): string[] {
   const [most, lines] = [Math.max(10, Math.floor(width / LETTER)), [""]];
   for (const word of text.split(" ")) {
     const last = lines[lines.length - 1]!;
@@ -24,7 +24,12 @@ const written = (text: string, x: number, y: number, bold = false): string =>
   `<text x="${x}" y="${y}" font-family="DejaVu Sans, Verdana, sans-serif" font-size="12"${bold ? ' font-weight="bold"' : ""}>${escaped(text)}</text>`;
 
 const strokes = (kind: Kind, path: string): string =>
-  STROKES[kind].map(([stroke, width, dash]) => `<path d="${path}" fill="none" stroke="${stroke}" stroke-width="${width}"${dash ? ` stroke-dasharray="${dash}"` : ""}/>`).join("");
+  STROKES[kind]
+    .map(
+      ([stroke, width, dash]) =>
+        `<path d="${path}" fill="none" stroke="${stroke}" stroke-width="${width}"${dash ? ` stroke-dasharray="${dash}"` : ""}/>`,
+    )
+    .join("");
 
 async function asData(from: string): Promise<string> {
   const image = new Image();
@@ -48,18 +53,26 @@ async function drawnSide(side: Side): Promise<Drawn> {
   const episode = scene.about.value.value!;
   const cameras = Object.entries(scene.layout.value?.cameras ?? {});
   const width = Math.max(PICTURE, cameras.length * (PICTURE + GAP) - GAP);
-  const heads = [...wrapped(fullNameOf(side), 0.9 * width).map((line) => [line, true] as const), ...wrapped(episode.verdict, width).map((line) => [line, false] as const), [`step ${episode.starts[at]} of ${episode.end}, call ${at} (0 to ${episode.starts.length - 1})`, false] as const];
+  const heads = [
+    ...wrapped(fullNameOf(side), 0.9 * width).map((line) => [line, true] as const),
+    ...wrapped(episode.verdict, width).map((line) => [line, false] as const),
+    [`step ${episode.starts[at]} of ${episode.end}, call ${at} (0 to ${episode.starts.length - 1})`, false] as const,
+  ];
   const texts = heads.map(([line, bold], i) => written(line, 0, (i + 1) * LINE - 4, bold));
   const top = heads.length * LINE + 4;
   let high = 0;
-  const pictures = await Promise.all(cameras.map(async ([camera, how], i) => {
-    const tall = Math.round((PICTURE * how.height) / how.width);
-    high = Math.max(high, tall);
-    const cell = [PICTURE / how.columns, tall / how.rows] as const;
-    const lines = linesOf({ scene, camera, how, at }).map(({ kind, inside }) => strokes(kind, outline(how, inside, cell)));
-    const below = how.stored ? `<image width="${PICTURE}" height="${tall}" preserveAspectRatio="none" href="${await asData(address.picture(scene.run.value, scene.name.value, camera, at))}"/>` : `<rect width="${PICTURE}" height="${tall}" fill="#cdcdcd"/>`;
-    return `<g transform="translate(${i * (PICTURE + GAP)} ${top})">${below}${lines.join("")}${written(camera, 0, tall + LINE - 4)}</g>`;
-  }));
+  const pictures = await Promise.all(
+    cameras.map(async ([camera, how], i) => {
+      const tall = Math.round((PICTURE * how.height) / how.width);
+      high = Math.max(high, tall);
+      const cell = [PICTURE / how.columns, tall / how.rows] as const;
+      const lines = linesOf({ scene, camera, how, at }).map(({ kind, inside }) => strokes(kind, outline(how, inside, cell)));
+      const below = how.stored
+        ? `<image width="${PICTURE}" height="${tall}" preserveAspectRatio="none" href="${await asData(address.picture(scene.run.value, scene.name.value, camera, at))}"/>`
+        : `<rect width="${PICTURE}" height="${tall}" fill="#cdcdcd"/>`;
+      return `<g transform="translate(${i * (PICTURE + GAP)} ${top})">${below}${lines.join("")}${written(camera, 0, tall + LINE - 4)}</g>`;
+    }),
+  );
   return { text: texts.join("") + pictures.join(""), width, height: top + high + LINE };
 }
 
@@ -78,11 +91,28 @@ export async function figure(): Promise<Drawn> {
   for (const kind of (Object.keys(STROKES) as Kind[]).filter(meaning)) {
     const room = 40 + LETTER * meaning(kind).length;
     if (at > GAP && at + room > width) [at, y] = [GAP, y + LINE];
-    parts.push(`<rect x="${at}" y="${y - 9}" width="24" height="9" fill="#8a8f96"/>`, strokes(kind, `M${at + 2} ${y - 4.5}H${at + 22}`), written(meaning(kind), at + 30, y));
+    parts.push(
+      `<rect x="${at}" y="${y - 9}" width="24" height="9" fill="#8a8f96"/>`,
+      strokes(kind, `M${at + 2} ${y - 4.5}H${at + 22}`),
+      written(meaning(kind), at + 30, y),
+    );
     at += room;
   }
-  const chosen = [["site", site.value], ["layer", layer.value], ["head", head.value], ["denoise step", denoise.value]].map(([name, one]) => (one === "mean" ? `mean of ${name}s` : `${name} ${one}`));
-  for (const line of wrapped(`Attention of the action queries: ${chosen.join(", ")}. Lines go around patches that get ${levels.value.join(" and ")} times what an even spread would give.`, width - 2 * GAP)) parts.push(written(line, GAP, (y += LINE)));
+  const chosen = [
+    ["site", site.value],
+    ["layer", layer.value],
+    ["head", head.value],
+    ["denoise step", denoise.value],
+  ].map(([name, one]) => (one === "mean" ? `mean of ${name}s` : `${name} ${one}`));
+  const settings = `Attention of the action queries: ${chosen.join(", ")}. Lines go around patches that get ${levels.value.join(" and ")} times what an even spread would give.`;
+  for (const line of wrapped(settings, width - 2 * GAP)) {
+    y += LINE;
+    parts.push(written(line, GAP, y));
+  }
   const height = y + GAP;
-  return { text: `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}" viewBox="0 0 ${width} ${height}"><rect width="${width}" height="${height}" fill="#fff"/>${parts.join("")}</svg>`, width, height };
+  return {
+    text: `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}" viewBox="0 0 ${width} ${height}"><rect width="${width}" height="${height}" fill="#fff"/>${parts.join("")}</svg>`,
+    width,
+    height,
+  };
 }

@@ -2,7 +2,7 @@
 import { computed, signal } from "@preact/signals";
 
 import { address, type HeadLifts, readJson } from "./answers";
-import { answered, cellsOf, head, layer, main, beside, nameOf, picked, runs, type Scene, setPart, type Side, sides, site } from "./state";
+import { answered, beside, cellsOf, head, layer, main, nameOf, picked, runs, type Scene, type Side, setPart, sides, site } from "./state";
 import { shown } from "./sums";
 
 interface Target {
@@ -16,29 +16,42 @@ const asked = (selector: string): string => `grid.json?${new URLSearchParams({ s
 /** What heads of an episode may look at; `id` is the same in the one beside it. */
 function targetsOf(scene: Scene): readonly Target[] {
   const known = (scene.layout.value?.targets ?? []).map(({ name, selector }, i) => ({ id: selector, name, path: `grid/${i}.json` }));
-  const keys = Object.entries(scene.layout.value?.cameras ?? {}).flatMap(([camera, how]) => how.keys.filter((_, i) => cellsOf(scene, camera).includes(how.cells[i]!)));
+  const keys = Object.entries(scene.layout.value?.cameras ?? {}).flatMap(([camera, how]) =>
+    how.keys.filter((_, i) => cellsOf(scene, camera).includes(how.cells[i]!)),
+  );
   const patches = keys.map((key) => `keys:${key}-${key}`).join(" | ");
   const { selector } = picked.value;
-  return [...known, ...(patches ? [{ id: "patches", name: "the clicked patches", path: asked(patches) }] : []), ...(selector ? [{ id: selector, name: selector, path: asked(selector) }] : [])];
+  return [
+    ...known,
+    ...(patches ? [{ id: "patches", name: "the clicked patches", path: asked(patches) }] : []),
+    ...(selector ? [{ id: selector, name: selector, path: asked(selector) }] : []),
+  ];
 }
 
 const chosen = signal<string | null>(null);
 const target = computed(() => targetsOf(main).find(({ id }) => id === chosen.value) ?? targetsOf(main)[0] ?? null);
 
-const liftsOf = (scene: Scene) => answered<HeadLifts>(() => {
-  const id = target.value?.id;
-  if (id === undefined || scene.about.value.value?.name !== scene.name.value) return null;
-  const path = targetsOf(scene).find((one) => one.id === id)?.path ?? asked(id);
-  return readJson<HeadLifts>(`${address.episode(scene.run.value, scene.name.value)}/${site.value}/${path}`);
-});
+const liftsOf = (scene: Scene) =>
+  answered<HeadLifts>(() => {
+    const id = target.value?.id;
+    if (id === undefined || scene.about.value.value?.name !== scene.name.value) return null;
+    const path = targetsOf(scene).find((one) => one.id === id)?.path ?? asked(id);
+    return readJson<HeadLifts>(`${address.episode(scene.run.value, scene.name.value)}/${site.value}/${path}`);
+  });
 const lifts = new Map([main, beside].map((scene) => [scene, liftsOf(scene)]));
 
-const known = ({ scene, at }: Side): number[] => (lifts.get(scene)!.value.value?.lift[at] ?? []).flat().filter((one): one is number => one !== null);
+const known = ({ scene, at }: Side): number[] =>
+  (lifts.get(scene)!.value.value?.lift[at] ?? []).flat().filter((one): one is number => one !== null);
 
 function Grid({ side, highest }: { side: Side; highest: number }) {
   const { value: numbers, error } = lifts.get(side.scene)!.value;
   const grid = numbers?.lift[side.at];
-  if (error) return <p class="soft">{nameOf(side)} {error}</p>;
+  if (error)
+    return (
+      <p class="soft">
+        {nameOf(side)} {error}
+      </p>
+    );
   if (!grid || !numbers) return null;
   const best = Math.max(...known(side));
   const place = grid.flatMap((line, i) => line.flatMap((one, j) => (one === best ? [[i, j] as const] : [])))[0];
@@ -49,7 +62,12 @@ function Grid({ side, highest }: { side: Side; highest: number }) {
   };
   return (
     <div>
-      <p>{nameOf(side) ? `${nameOf(side)}: ` : ""}{place ? `most: layer ${numbers.layers[place[0]]}, head ${numbers.heads[place[1]]}, ${shown(best)} times even${best > 1 ? "" : ": no head looks more than evenly"}` : "none, it is out of sight in this call"}</p>
+      <p>
+        {nameOf(side) ? `${nameOf(side)}: ` : ""}
+        {place
+          ? `most: layer ${numbers.layers[place[0]]}, head ${numbers.heads[place[1]]}, ${shown(best)} times even${best > 1 ? "" : ": no head looks more than evenly"}`
+          : "none, it is out of sight in this call"}
+      </p>
       <table>
         <tbody>
           {grid.map((line, i) => (
@@ -60,8 +78,13 @@ function Grid({ side, highest }: { side: Side; highest: number }) {
                 return (
                   <td key={j}>
                     <button
-                      disabled={!has} aria-pressed={layer.value === numbers.layers[i] && head.value === numbers.heads[j]} aria-label={about} title={about} class={place?.[0] === i && place[1] === j ? "best" : ""}
-                      style={{ "--strength": Math.min(1, Math.max(0, (one ?? 0) / highest)).toFixed(3) }} onClick={() => toggle(numbers.layers[i]!, numbers.heads[j]!)}
+                      disabled={!has}
+                      aria-pressed={layer.value === numbers.layers[i] && head.value === numbers.heads[j]}
+                      aria-label={about}
+                      title={about}
+                      class={place?.[0] === i && place[1] === j ? "best" : ""}
+                      style={{ "--strength": Math.min(1, Math.max(0, (one ?? 0) / highest)).toFixed(3) }}
+                      onClick={() => toggle(numbers.layers[i]!, numbers.heads[j]!)}
                     />
                   </td>
                 );
@@ -79,13 +102,24 @@ export function HeadGrid() {
   const highest = Math.max(4, ...sides.value.flatMap(known));
   return (
     <section class="heads" aria-label="Heads">
-      <label>Which head looks at{" "}
+      <label>
+        Which head looks at{" "}
         <select value={target.value.id} onChange={(event) => (chosen.value = event.currentTarget.value)}>
-          {targetsOf(main).map(({ id, name }) => <option value={id}>{name}</option>)}
-        </select>{" "}in this call?
+          {targetsOf(main).map(({ id, name }) => (
+            <option value={id}>{name}</option>
+          ))}
+        </select>{" "}
+        in this call?
       </label>
-      <div class="grids">{sides.value.map((side) => <Grid key={nameOf(side)} side={side} highest={highest} />)}</div>
-      <p class="soft">rows: layers; columns: heads; full colour: {shown(highest)} times even. {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone."}</p>
+      <div class="grids">
+        {sides.value.map((side) => (
+          <Grid key={nameOf(side)} side={side} highest={highest} />
+        ))}
+      </div>
+      <p class="soft">
+        rows: layers; columns: heads; full colour: {shown(highest)} times even.{" "}
+        {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone."}
+      </p>
     </section>
   );
 }

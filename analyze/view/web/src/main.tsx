@@ -3,23 +3,37 @@ import { computed, effect } from "@preact/signals";
 import { render } from "preact";
 
 import "./page.css";
+import { serverGone } from "./answers";
+import { reading } from "./effects";
 import { EpisodePage } from "./episode";
 import { Overview } from "./overview";
-import { serverGone } from "./answers";
-import { axes, beside, closeEpisode, denoise, effects, episodeName, head, layer, main, mended, playing, run, runs, setPart, walk } from "./state";
+import { axes, beside, closeEpisode, denoise, episodeName, head, layer, main, mended, playing, run, runs, setPart, walk } from "./state";
 
 function App() {
   return (
     <>
-      {serverGone.value ? <p class="banner" role="alert">Nobody answers: vla-attention view has ended. Start it again, and load this page anew.</p> : null}
-      {mended.value ? <p class="banner" role="status">{mended.value}</p> : null}
+      {serverGone.value ? (
+        <p class="banner" role="alert">
+          Nobody answers: vla-attention view has ended. Start it again, and load this page anew.
+        </p>
+      ) : null}
+      {mended.value ? (
+        <p class="banner" role="status">
+          {mended.value}
+        </p>
+      ) : null}
       <Shown />
     </>
   );
 }
 
 function Shown() {
-  if (runs.value.error) return <p class="error" role="alert">{runs.value.error}</p>;
+  if (runs.value.error)
+    return (
+      <p class="error" role="alert">
+        {runs.value.error}
+      </p>
+    );
   if (!runs.value.value) return <p class="soft">Reading …</p>;
   return episodeName.value ? <EpisodePage /> : <Overview />;
 }
@@ -32,7 +46,8 @@ function next(known: readonly number[] | undefined, now: number | "mean", by: nu
 
 addEventListener("keydown", (event) => {
   const on = event.target as HTMLElement;
-  if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea") || !episodeName.value) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea") || !episodeName.value)
+    return;
   const acts: Record<string, () => void> = {
     ArrowLeft: () => walk(-1),
     ArrowRight: () => walk(1),
@@ -63,9 +78,16 @@ let last = episodeName.peek();
 effect(() => {
   const [now, before] = [episodeName.value, last];
   last = now;
-  if (now !== before) requestAnimationFrame(() => (now ? page : (document.querySelector<HTMLElement>(`[data-episode="${CSS.escape(before)}"]`) ?? page)).focus());
+  if (now !== before)
+    requestAnimationFrame(() =>
+      (now ? page : (document.querySelector<HTMLElement>(`[data-episode="${CSS.escape(before)}"]`) ?? page)).focus(),
+    );
 });
 // For who waits until all is drawn: taken back at once, given when the browser has drawn.
-const ready = computed(() => !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !effects.value.pending)));
-const mark = (): void => void (page.dataset.ready = ready.peek() ? "1" : "");
+const ready = computed(
+  () => !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !reading.value)),
+);
+const mark = (): void => {
+  page.dataset.ready = ready.peek() ? "1" : "";
+};
 effect(() => void (ready.value ? requestAnimationFrame(mark) : mark()));

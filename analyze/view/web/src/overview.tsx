@@ -9,13 +9,29 @@ const FAILED = ["failed", "fails", "failure", "unsolved", "unsuccessful"];
 
 /** Whether an episode fits all words of a search; "failed", "not solved" and "solved" are outcomes. */
 export function fits(line: EpisodeLine, search: string): boolean {
-  const text = search.toLowerCase().replace(/\b(task|scene) (?=\d)/g, "$1").replace(/\bnot (solved|successful)\b/g, "failed");
-  const known = [`task${line.task}`, line.scene == null ? "" : `scene${line.scene}`, line.name, line.instruction, line.told, line.verdict, line.failed].join(" ").toLowerCase();
-  return text.split(/\s+/).filter(Boolean).every((word) => {
-    if (FAILED.includes(word)) return line.outcome === false;
-    if (["solved", "successful", "success"].includes(word)) return line.outcome === true;
-    return known.includes(word);
-  });
+  const text = search
+    .toLowerCase()
+    .replace(/\b(task|scene) (?=\d)/g, "$1")
+    .replace(/\bnot (solved|successful)\b/g, "failed");
+  const known = [
+    `task${line.task}`,
+    line.scene == null ? "" : `scene${line.scene}`,
+    line.name,
+    line.instruction,
+    line.told,
+    line.verdict,
+    line.failed,
+  ]
+    .join(" ")
+    .toLowerCase();
+  return text
+    .split(/\s+/)
+    .filter(Boolean)
+    .every((word) => {
+      if (FAILED.includes(word)) return line.outcome === false;
+      if (["solved", "successful", "success"].includes(word)) return line.outcome === true;
+      return known.includes(word);
+    });
 }
 
 const chips: Record<string, { name: string; holds: (line: EpisodeLine, median: number) => boolean }> = {
@@ -40,7 +56,13 @@ const orders: Record<string, { name: string; of: (line: EpisodeLine) => number |
   shortest: { name: "fewest steps first", of: ({ num_steps }) => num_steps || null },
   longest: { name: "most steps first", of: ({ num_steps }) => (num_steps ? -num_steps : null) },
   lowest: { name: "lowest ratio first", of: ({ name }) => numbersOf.value.get(name)?.ratio },
-  highest: { name: "highest ratio first", of: ({ name }) => { const ratio = numbersOf.value.get(name)?.ratio; return ratio == null ? null : -ratio; } },
+  highest: {
+    name: "highest ratio first",
+    of: ({ name }) => {
+      const ratio = numbersOf.value.get(name)?.ratio;
+      return ratio == null ? null : -ratio;
+    },
+  },
 };
 const numbersOf = computed(() => new Map((runNumbers.value?.episodes ?? []).map((one) => [one.name, one])));
 /** What a link names, or what stands first where there is nothing of that name. */
@@ -48,7 +70,12 @@ const chosen = <T,>(all: Record<string, T>, name: string): T => (Object.keys(all
 
 const listed = computed(() => {
   const chip = chosen(chips, part("show"));
-  return (run.value?.episodes ?? []).filter((line) => (part("task") === "" || part("task") === String(line.task)) && chip.holds(line, medians.value.get(line.task)!) && fits(line, part("find")));
+  return (run.value?.episodes ?? []).filter(
+    (line) =>
+      (part("task") === "" || part("task") === String(line.task)) &&
+      chip.holds(line, medians.value.get(line.task)!) &&
+      fits(line, part("find")),
+  );
 });
 
 const ids = computed(() => [...new Set(run.value?.episodes.map(({ task }) => task))]);
@@ -76,16 +103,28 @@ const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcom
 function Card({ line }: { line: EpisodeLine }) {
   const numbers = numbersOf.value.get(line.name);
   return (
-    <button class={`card ${kindOf(line)}`} data-episode={line.name} title={line.failed ?? line.verdict} onClick={() => openEpisode(line.name)}>
+    <button
+      class={`card ${kindOf(line)}`}
+      data-episode={line.name}
+      title={line.failed ?? line.verdict}
+      onClick={() => openEpisode(line.name)}
+    >
       {line.picture ? (
         <img src={address.picture(runNumber.value, line.name, ...line.picture)} alt="" loading="lazy" />
       ) : (
         <span class="no-picture">{line.failed === undefined ? "no pictures" : "cannot be read"}</span>
       )}
       <span class="about">
-        <b>{mark(line)} {chosen(orders, part("sort")) === orders.task ? "" : `task ${line.task}, `}{line.scene == null ? line.episode : `scene ${line.scene}`}</b>
+        <b>
+          {mark(line)} {chosen(orders, part("sort")) === orders.task ? "" : `task ${line.task}, `}
+          {line.scene == null ? line.episode : `scene ${line.scene}`}
+        </b>
         {line.num_steps ? <span>{line.num_steps} steps</span> : null}
-        {numbers?.ratio != null ? <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)</span> : null}
+        {numbers?.ratio != null ? (
+          <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>
+            ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)
+          </span>
+        ) : null}
       </span>
     </button>
   );
@@ -101,16 +140,37 @@ function Matrix() {
     <section class="matrix" aria-label="Told and scene">
       <p class="soft">Told (rows) in the scene and initial state of task (columns); ✓ did what it was told. A cell opens its episode.</p>
       <table>
-        <thead><tr><th />{scenes.map((scene) => <th scope="col" key={scene} title={told.get(scene)}>{scene}</th>)}</tr></thead>
+        <thead>
+          <tr>
+            <th />
+            {scenes.map((scene) => (
+              <th scope="col" key={scene} title={told.get(scene)}>
+                {scene}
+              </th>
+            ))}
+          </tr>
+        </thead>
         <tbody>
           {[...told].map(([task, instruction]) => (
             <tr key={task}>
-              <th scope="row">{instruction} <span class="soft">{task}</span></th>
+              <th scope="row">
+                {instruction} <span class="soft">{task}</span>
+              </th>
               {scenes.map((scene) => (
                 <td key={scene} class={scene === task ? "own" : ""}>
-                  {lines.filter((line) => line.task === task && line.scene === scene).map((line) => (
-                    <button key={line.name} class={kindOf(line)} title={line.verdict} aria-label={`task ${task} told in scene ${scene}: ${line.verdict}`} onClick={() => openEpisode(line.name)}>{mark(line)}</button>
-                  ))}
+                  {lines
+                    .filter((line) => line.task === task && line.scene === scene)
+                    .map((line) => (
+                      <button
+                        key={line.name}
+                        class={kindOf(line)}
+                        title={line.verdict}
+                        aria-label={`task ${task} told in scene ${scene}: ${line.verdict}`}
+                        onClick={() => openEpisode(line.name)}
+                      >
+                        {mark(line)}
+                      </button>
+                    ))}
                 </td>
               ))}
             </tr>
@@ -134,7 +194,11 @@ function Findings() {
             <b>{asks}</b> {sentence} {limit ? <span class="soft">{limit}</span> : null}
           </p>
         ))}
-        {numbers.findings.length > FIRST_FINDINGS ? <button onClick={() => (all.value = !all.value)}>{all.value ? "fewer" : `${numbers.findings.length - FIRST_FINDINGS} more`}</button> : null}
+        {numbers.findings.length > FIRST_FINDINGS ? (
+          <button onClick={() => (all.value = !all.value)}>
+            {all.value ? "fewer" : `${numbers.findings.length - FIRST_FINDINGS} more`}
+          </button>
+        ) : null}
       </section>
     );
   }
@@ -146,54 +210,99 @@ export function Overview() {
   if (!shownRun) return null;
   const solved = shownRun.episodes.filter(({ outcome }) => outcome === true).length;
   const known = shownRun.episodes.filter(({ outcome }) => outcome === true || outcome === false).length;
-  const used = Object.entries(chips).filter(([name, { holds }]) => name === "all" || shownRun.episodes.some((line) => holds(line, medians.value.get(line.task)!)));
+  const used = Object.entries(chips).filter(
+    ([name, { holds }]) => name === "all" || shownRun.episodes.some((line) => holds(line, medians.value.get(line.task)!)),
+  );
   return (
     <div class="overview">
       <header>
         {(runs.value.value?.runs.length ?? 0) > 1 ? (
           <nav>
             {runs.value.value!.runs.map(({ name }, i) => (
-              <button aria-pressed={i === runNumber.value} onClick={() => setPart({ run: i, show: "all", find: "", task: "" })}>{name}</button>
+              <button aria-pressed={i === runNumber.value} onClick={() => setPart({ run: i, show: "all", find: "", task: "" })}>
+                {name}
+              </button>
             ))}
           </nav>
         ) : null}
         <h1>{shownRun.name}</h1>
         <p>
-          {shownRun.policy}{shownRun.untrained ? " (random weights)" : ""} in {shownRun.suite}:{" "}
-          {shownRun.rerun ? "policy calls of another run, made again" : known ? `${solved} of ${known} episodes solved` : "outcomes not known"}
+          {shownRun.policy}
+          {shownRun.untrained ? " (random weights)" : ""} in {shownRun.suite}:{" "}
+          {shownRun.rerun
+            ? "policy calls of another run, made again"
+            : known
+              ? `${solved} of ${known} episodes solved`
+              : "outcomes not known"}
         </p>
-        {shownRun.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
-        {shownRun.notes?.map((line) => <p class="soft" key={line}>{line}</p>)}
+        {shownRun.changed.map((line) => (
+          <p class="banner" key={line}>
+            {line}
+          </p>
+        ))}
+        {shownRun.notes?.map((line) => (
+          <p class="soft" key={line}>
+            {line}
+          </p>
+        ))}
       </header>
       <Findings />
-      <div class="filters" role="search">
+      <search class="filters">
         {used.map(([name, { name: text }]) => (
-          <button class="chip" aria-pressed={part("show") === name} onClick={() => setPart({ show: name })}>{text}</button>
+          <button class="chip" aria-pressed={part("show") === name} onClick={() => setPart({ show: name })}>
+            {text}
+          </button>
         ))}
         {ids.value.length > 1 ? (
           <select aria-label="Task" value={part("task")} onChange={(event) => setPart({ task: event.currentTarget.value })}>
             <option value="">all tasks</option>
-            {ids.value.map((task) => <option value={String(task)}>task {task}</option>)}
+            {ids.value.map((task) => (
+              <option value={String(task)}>task {task}</option>
+            ))}
           </select>
         ) : null}
-        <select aria-label="Order" value={chosen(orders, part("sort")) === orders.task ? "task" : part("sort")} onChange={(event) => setPart({ sort: event.currentTarget.value })}>
-          {Object.entries(orders).map(([name, { name: text }]) => <option value={name}>{text}</option>)}
+        <select
+          aria-label="Order"
+          value={chosen(orders, part("sort")) === orders.task ? "task" : part("sort")}
+          onChange={(event) => setPart({ sort: event.currentTarget.value })}
+        >
+          {Object.entries(orders).map(([name, { name: text }]) => (
+            <option value={name}>{text}</option>
+          ))}
         </select>
-        <input type="search" aria-label="Find episodes" placeholder="find: red, failed, not solved …" value={part("find")} onInput={(event) => setPart({ find: event.currentTarget.value })} />
-        <span class="soft" role="status">{listed.value.length} of {shownRun.episodes.length} episodes</span>
-      </div>
+        <input
+          type="search"
+          aria-label="Find episodes"
+          placeholder="find: red, failed, not solved …"
+          value={part("find")}
+          onInput={(event) => setPart({ find: event.currentTarget.value })}
+        />
+        <span class="soft" role="status">
+          {listed.value.length} of {shownRun.episodes.length} episodes
+        </span>
+      </search>
       <Matrix />
       <div class={`tasks of-${Math.max(0, ...tasks.value.map(({ lines }) => lines.length))}`}>
         {tasks.value.map(({ task, instruction, lines }) => (
-        <section class="task" key={`${task} ${instruction}`}>
-          {task ? <h2><span class="soft">task {task}</span> {instruction}</h2> : null}
-          <div class="cards">{lines.map((line) => <Card key={line.name} line={line} />)}</div>
-        </section>
+          <section class="task" key={`${task} ${instruction}`}>
+            {task ? (
+              <h2>
+                <span class="soft">task {task}</span> {instruction}
+              </h2>
+            ) : null}
+            <div class="cards">
+              {lines.map((line) => (
+                <Card key={line.name} line={line} />
+              ))}
+            </div>
+          </section>
         ))}
       </div>
       {!shownRun.episodes.length ? <p>The run has no episodes yet. Load the page again when it has.</p> : null}
       {shownRun.episodes.length && !listed.value.length ? (
-        <p>No episode fits. <button onClick={() => setPart({ show: "all", find: "", task: "" })}>Show all</button></p>
+        <p>
+          No episode fits. <button onClick={() => setPart({ show: "all", find: "", task: "" })}>Show all</button>
+        </p>
       ) : null}
     </div>
   );

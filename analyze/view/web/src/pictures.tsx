@@ -4,7 +4,22 @@ import { computed, signal } from "@preact/signals";
 import { address, type CameraLayout } from "./answers";
 import { Hint } from "./hint";
 import {
-  about, cellsOf, covered, evenOf, groupOf, hasCells, layout, main, massesAt, massesOf, numReplans, picked, type Scene, setPart, toggled, uniformAt,
+  about,
+  cellsOf,
+  covered,
+  evenOf,
+  groupOf,
+  hasCells,
+  layout,
+  main,
+  massesAt,
+  massesOf,
+  numReplans,
+  picked,
+  type Scene,
+  setPart,
+  toggled,
+  uniformAt,
 } from "./state";
 import { cellLifts, cellSums, outline, percent, scaleEnd, shown } from "./sums";
 
@@ -35,8 +50,14 @@ export interface At {
 
 /** How lines are drawn, one over the other: [colour, width in pixels, dashes]. A saved picture has no style sheet. */
 export const STROKES = {
-  first: [["#000", 3.4, ""], ["#fff", 1.4, ""]],
-  second: [["#000", 5, ""], ["#f0e442", 2.6, ""]],
+  first: [
+    ["#000", 3.4, ""],
+    ["#fff", 1.4, ""],
+  ],
+  second: [
+    ["#000", 5, ""],
+    ["#f0e442", 2.6, ""],
+  ],
   named: [["#00c08b", 2.4, "5 4"]],
   touched: [["#ff6a1f", 2.4, "5 4"]],
   picked: [["#56b4e9", 3, ""]],
@@ -44,13 +65,14 @@ export const STROKES = {
 export type Kind = keyof typeof STROKES;
 
 /** What a kind of lines says; empty where none of it can be there. */
-export const meaning = (kind: Kind): string => ({
-  first: `${FIRST} times an even spread`,
-  second: levels.value[1] ? `${levels.value[1]} times` : "",
-  named: about.value.value?.objects.length && covered.value.value ? "named in the sentence" : "",
-  touched: about.value.value?.objects.length && covered.value.value ? "touched" : "",
-  picked: "",
-})[kind];
+export const meaning = (kind: Kind): string =>
+  ({
+    first: `${FIRST} times an even spread`,
+    second: levels.value[1] ? `${levels.value[1]} times` : "",
+    named: about.value.value?.objects.length && covered.value.value ? "named in the sentence" : "",
+    touched: about.value.value?.objects.length && covered.value.value ? "touched" : "",
+    picked: "",
+  })[kind];
 
 /** The lines of a picture: their kind, the cells that they go around, and of an object its name. */
 export function linesOf({ scene, camera, how, at }: At): { kind: Kind; inside: (cell: number) => boolean; title: string }[] {
@@ -58,24 +80,48 @@ export function linesOf({ scene, camera, how, at }: At): { kind: Kind; inside: (
   const lifts = mass && even ? cellLifts(mass, even, how) : null;
   const episode = scene.about.value.value;
   const touched = new Set(episode?.events.map(({ thing }) => thing));
-  const things = (episode?.objects ?? []).filter(({ named, name }) => named || touched.has(name)).flatMap(({ name, shown: title, named }) => {
-    const cells = new Set(scene.covered.value.value?.[camera]?.[name]?.[at] ?? []);
-    return cells.size ? [{ kind: named ? ("named" as const) : ("touched" as const), inside: (cell: number) => cells.has(cell), title }] : [];
-  });
+  const things = (episode?.objects ?? [])
+    .filter(({ named, name }) => named || touched.has(name))
+    .flatMap(({ name, shown: title, named }) => {
+      const cells = new Set(scene.covered.value.value?.[camera]?.[name]?.[at] ?? []);
+      return cells.size
+        ? [{ kind: named ? ("named" as const) : ("touched" as const), inside: (cell: number) => cells.has(cell), title }]
+        : [];
+    });
   const own = new Set(cellsOf(scene, camera));
   return [
-    ...(lifts ? levels.value.map((level, i) => ({ kind: i ? ("second" as const) : ("first" as const), inside: (cell: number) => lifts[cell]! >= level, title: "" })) : []),
+    ...(lifts
+      ? levels.value.map((level, i) => ({
+          kind: i ? ("second" as const) : ("first" as const),
+          inside: (cell: number) => lifts[cell]! >= level,
+          title: "",
+        }))
+      : []),
     ...things,
     ...(own.size ? [{ kind: "picked" as const, inside: (cell: number) => own.has(cell), title: "" }] : []),
   ];
 }
 
 function Strokes({ kind, path, title }: { kind: Kind; path: string; title?: string }) {
-  return <g class={kind}>{STROKES[kind].map(([stroke, width, dash]) => <path key={stroke} d={path} stroke={stroke} stroke-width={width} stroke-dasharray={dash}>{title ? <title>{title}</title> : null}</path>)}</g>;
+  return (
+    <g class={kind}>
+      {STROKES[kind].map(([stroke, width, dash]) => (
+        <path key={stroke} d={path} stroke={stroke} stroke-width={width} stroke-dasharray={dash}>
+          {title ? <title>{title}</title> : null}
+        </path>
+      ))}
+    </g>
+  );
 }
 
 function Lines(one: At) {
-  return <>{linesOf(one).map(({ kind, inside, title }, i) => <Strokes key={i} kind={kind} path={outline(one.how, inside)} title={title} />)}</>;
+  return (
+    <>
+      {linesOf(one).map(({ kind, inside, title }, i) => (
+        <Strokes key={i} kind={kind} path={outline(one.how, inside)} title={title} />
+      ))}
+    </>
+  );
 }
 
 function cellAt(event: MouseEvent & { currentTarget: Element }, how: CameraLayout): number {
@@ -91,7 +137,9 @@ function aboutCell({ scene, camera, how, at }: At, cell: number): string {
   if (!mass || !even) return "";
   const sums = cellSums(mass, how);
   const ofPicture = sums.reduce((a, b) => a + b, 0);
-  const things = Object.entries(scene.covered.value.value?.[camera] ?? {}).filter(([, ofReplans]) => ofReplans[at]?.includes(cell)).map(([name]) => name.replaceAll("_", " "));
+  const things = Object.entries(scene.covered.value.value?.[camera] ?? {})
+    .filter(([, ofReplans]) => ofReplans[at]?.includes(cell))
+    .map(([name]) => name.replaceAll("_", " "));
   const where = `row ${Math.floor(cell / how.columns)}, column ${cell % how.columns}`;
   return `${where}: ${percent(sums[cell])} of all attention, ${percent(sums[cell]! / ofPicture)} of this picture's, ${shown(cellLifts(mass, even, how)[cell])} times even${things.length ? `, ${things.join(", ")}` : ""}`;
 }
@@ -101,11 +149,13 @@ function Picture(one: At) {
   const { scene, camera, how, at } = one;
   const here = pointed.value?.camera === camera && pointed.value.scene === scene ? pointed.value.cell : null;
   const toggle = (cell: number): void => {
-    if (hasCells(scene, camera)) setPart({ group: groupOf({ cells: { ...picked.value.cells, [camera]: toggled(cellsOf(scene, camera), cell) } }) });
+    if (hasCells(scene, camera))
+      setPart({ group: groupOf({ cells: { ...picked.value.cells, [camera]: toggled(cellsOf(scene, camera), cell) } }) });
   };
   const byKey = (event: KeyboardEvent): void => {
     const step = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -how.columns, ArrowDown: how.columns }[event.key];
-    if (step !== undefined) pointed.value = { scene, camera, cell: here === null ? 0 : (here + step + how.rows * how.columns) % (how.rows * how.columns) };
+    if (step !== undefined)
+      pointed.value = { scene, camera, cell: here === null ? 0 : (here + step + how.rows * how.columns) % (how.rows * how.columns) };
     else if (event.key === "Enter" && here !== null) toggle(here);
     else return;
     event.preventDefault();
@@ -114,9 +164,22 @@ function Picture(one: At) {
   return (
     <figure class="picture">
       <div class="stack" data-camera={camera}>
-        {how.stored ? <img src={address.picture(scene.run.value, scene.name.value, camera, at)} alt={`${camera} at call ${at}`} width={how.width} height={how.height} /> : <div class="grey" />}
+        {how.stored ? (
+          <img
+            src={address.picture(scene.run.value, scene.name.value, camera, at)}
+            alt={`${camera} at call ${at}`}
+            width={how.width}
+            height={how.height}
+          />
+        ) : (
+          <div class="grey" />
+        )}
         <svg
-          viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" role="img" tabindex={0} aria-label={`${camera}: arrow keys go from patch to patch, Enter picks one`}
+          viewBox={`0 0 ${how.columns} ${how.rows}`}
+          preserveAspectRatio="none"
+          role="img"
+          tabindex={0}
+          aria-label={`${camera}: arrow keys go from patch to patch, Enter picks one`}
           onKeyDown={(event) => byKey(event)}
           onMouseMove={(event) => (pointed.value = { scene, camera, cell: cellAt(event, how) })}
           onMouseLeave={() => (pointed.value = null)}
@@ -128,7 +191,11 @@ function Picture(one: At) {
       </div>
       <figcaption>
         <b>{camera}</b>
-        {how.mirrored || !how.upright ? <Hint text={`The policy sees it ${[how.mirrored && "mirrored", !how.upright && "upside down"].filter(Boolean).join(" and ")}; here it is as a person sees the scene.`} /> : null}
+        {how.mirrored || !how.upright ? (
+          <Hint
+            text={`The policy sees it ${[how.mirrored && "mirrored", !how.upright && "upside down"].filter(Boolean).join(" and ")}; here it is as a person sees the scene.`}
+          />
+        ) : null}
         {how.stored ? null : " no pictures were stored: attention alone"}
         <span class="soft">{here !== null ? ` ${aboutCell(one, here)}` : how.note ? ` ${how.note}` : ""}</span>
       </figcaption>
@@ -143,11 +210,22 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
   if (!episode) return null;
   if (!cameras.length) {
     const other = Object.entries(episode.sites).find(([, { cameras: of }]) => Object.keys(of).length)?.[0];
-    return <p>The keys of this site are no patches of pictures. {other ? <button onClick={() => setPart({ site: other })}>Show site {other}</button> : null}</p>;
+    return (
+      <p>
+        The keys of this site are no patches of pictures.{" "}
+        {other ? <button onClick={() => setPart({ site: other })}>Show site {other}</button> : null}
+      </p>
+    );
   }
   return (
-    <section class={`pictures of-${Math.min(cameras.length, 3)}`} aria-label={`Pictures of ${episode.name}${scene === main ? "" : " beside it"}`} aria-busy={scene.masses.value === null}>
-      {cameras.map(([camera, how]) => <Picture key={camera} scene={scene} camera={camera} how={how} at={at} />)}
+    <section
+      class={`pictures of-${Math.min(cameras.length, 3)}`}
+      aria-label={`Pictures of ${episode.name}${scene === main ? "" : " beside it"}`}
+      aria-busy={scene.masses.value === null}
+    >
+      {cameras.map(([camera, how]) => (
+        <Picture key={camera} scene={scene} camera={camera} how={how} at={at} />
+      ))}
     </section>
   );
 }
@@ -155,7 +233,14 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
 export function Legend() {
   return (
     <p class="legend soft">
-      {(Object.keys(STROKES) as Kind[]).filter(meaning).map((kind) => <span key={kind}><svg viewBox="0 0 24 8" class="sample"><Strokes kind={kind} path="M2 4H22" /></svg>{meaning(kind)}</span>)}
+      {(Object.keys(STROKES) as Kind[]).filter(meaning).map((kind) => (
+        <span key={kind}>
+          <svg viewBox="0 0 24 8" class="sample" aria-hidden="true">
+            <Strokes kind={kind} path="M2 4H22" />
+          </svg>
+          {meaning(kind)}
+        </span>
+      ))}
     </p>
   );
 }

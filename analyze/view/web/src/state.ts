@@ -2,8 +2,20 @@
 import { batch, computed, effect, type ReadonlySignal, type Signal, signal } from "@preact/signals";
 
 import {
-  type About, address, type Covered, type Effect, type Effects, type EpisodeEvent, type EpisodeLine, type Groups, type NumberArray, readArray,
-  readJson, readJsonNow, readRuns, type RunNumbers, type SiteLayout, type Word,
+  type About,
+  address,
+  type Covered,
+  type EpisodeEvent,
+  type EpisodeLine,
+  type Groups,
+  type NumberArray,
+  type RunNumbers,
+  readArray,
+  readJson,
+  readJsonNow,
+  readRuns,
+  type SiteLayout,
+  type Word,
 } from "./answers";
 import { type Choice, keyMasses } from "./sums";
 
@@ -29,19 +41,40 @@ export function answered<T>(ask: () => Promise<T> | null): ReadonlySignal<Answer
     const settle = (value: T | null, error: string | null): void => {
       if (own === newest) answer.value = { value, error, pending: false };
     };
-    asked.then((value) => settle(value, null), (error: unknown) => settle(null, error instanceof Error ? error.message : String(error)));
+    asked.then(
+      (value) => settle(value, null),
+      (error: unknown) => settle(null, error instanceof Error ? error.message : String(error)),
+    );
   });
   return answer;
 }
 
 /** The parts of the link, as texts; what is not in it has its default. */
 const DEFAULTS = {
-  run: "0", episode: "", replan: "0", site: "", layer: "mean", head: "mean", denoise: "mean", words: "", beside: "", group: "",
-  without: "", find: "", task: "", show: "all", curve: "ratio", step: "", sort: "task",
+  run: "0",
+  episode: "",
+  replan: "0",
+  site: "",
+  layer: "mean",
+  head: "mean",
+  denoise: "mean",
+  words: "",
+  beside: "",
+  group: "",
+  without: "",
+  find: "",
+  task: "",
+  show: "all",
+  curve: "ratio",
+  step: "",
+  sort: "task",
 } as const;
 export type Part = keyof typeof DEFAULTS;
 
-const link = Object.fromEntries(Object.entries(DEFAULTS).map(([name, text]) => [name, signal<string>(text)])) as Record<Part, Signal<string>>;
+const link = Object.fromEntries(Object.entries(DEFAULTS).map(([name, text]) => [name, signal<string>(text)])) as Record<
+  Part,
+  Signal<string>
+>;
 
 function readLink(): void {
   const given = new URLSearchParams(location.hash.slice(1));
@@ -89,10 +122,14 @@ export function closeEpisode(): void {
 }
 
 export const runs = answered(() => readRuns());
-export const runNumber = computed(() => Math.max(0, Math.min(Math.trunc(Number(part("run"))) || 0, (runs.value.value?.runs.length ?? 1) - 1)));
+export const runNumber = computed(() =>
+  Math.max(0, Math.min(Math.trunc(Number(part("run"))) || 0, (runs.value.value?.runs.length ?? 1) - 1)),
+);
 export const run = computed(() => runs.value.value?.runs[runNumber.value] ?? null);
 /** A page of one episode has no list. */
-export const onlyEpisode = computed(() => (runs.value.value?.copy && runs.value.value.runs.length === 1 && run.value?.episodes.length === 1 ? run.value.episodes[0]!.name : ""));
+export const onlyEpisode = computed(() =>
+  runs.value.value?.copy && runs.value.value.runs.length === 1 && run.value?.episodes.length === 1 ? run.value.episodes[0]!.name : "",
+);
 export const episodeName = computed(() => part("episode") || onlyEpisode.value);
 
 export const runNumbers = signal<RunNumbers | null>(null);
@@ -101,7 +138,7 @@ effect(() => {
   const wanted = runNumber.value;
   runNumbers.value = null;
   if (!run.value) return;
-  let timer = 0;
+  let timer: ReturnType<typeof setTimeout> | undefined;
   const read = async (): Promise<void> => {
     const numbers = await readJsonNow<RunNumbers>(address.numbers(wanted)).catch(() => null);
     if (runNumber.peek() !== wanted) return;
@@ -118,7 +155,9 @@ export const site = computed(() => {
   return !run.value || known.includes(part("site")) ? part("site") : (known[0] ?? "");
 });
 /** What the link names and the run does not have, in a sentence. */
-export const mended = computed(() => (run.value && part("site") && part("site") !== site.value ? `The run has no site '${part("site")}': '${site.value}' is shown.` : ""));
+export const mended = computed(() =>
+  run.value && part("site") && part("site") !== site.value ? `The run has no site '${part("site")}': '${site.value}' is shown.` : "",
+);
 export const axes = computed(() => run.value?.sites.find(({ name }) => name === site.value) ?? null);
 
 const choice = (name: "layer" | "head" | "denoise", known: () => readonly number[]): ReadonlySignal<Choice> =>
@@ -129,7 +168,8 @@ const choice = (name: "layer" | "head" | "denoise", known: () => readonly number
 export const layer = choice("layer", () => axes.value?.layers ?? []);
 export const head = choice("head", () => axes.value?.heads ?? []);
 export const denoise = choice("denoise", () => axes.value?.denoise_steps ?? []);
-const position = (known: readonly number[] | undefined, chosen: Choice): Choice => (chosen === "mean" ? chosen : (known ?? []).indexOf(chosen));
+const position = (known: readonly number[] | undefined, chosen: Choice): Choice =>
+  chosen === "mean" ? chosen : (known ?? []).indexOf(chosen);
 
 /** What was clicked or typed: cells of cameras, words (positions), selectors. In the link as CAMERA:1.2.3;words:0.2;=selector */
 export interface Picked {
@@ -146,7 +186,11 @@ export const picked = computed<Picked>(() => {
     const at = text.lastIndexOf(":");
     if (text.startsWith("=")) selector = text.slice(1);
     else if (text.startsWith("words:")) chosen = text.slice(6).split(".").map(Number);
-    else cells[text.slice(0, at)] = text.slice(at + 1).split(".").map(Number);
+    else
+      cells[text.slice(0, at)] = text
+        .slice(at + 1)
+        .split(".")
+        .map(Number);
   }
   return { cells, words: chosen, selector };
 });
@@ -174,7 +218,8 @@ const readAt = <T>(at: string | null): Promise<T> | null => (at === null ? null 
 const arrayAt = (at: string | null): Promise<NumberArray> | null => (at === null ? null : readArray(at));
 
 function sceneOf(ofRun: ReadonlySignal<number>, name: ReadonlySignal<string>): Scene {
-  const own = (path: string): string | null => (runs.value.value && name.value ? `${address.episode(ofRun.value, name.value)}/${path}` : null);
+  const own = (path: string): string | null =>
+    runs.value.value && name.value ? `${address.episode(ofRun.value, name.value)}/${path}` : null;
   const ofSite = (path: string): string | null => (about.value.value && site.value ? own(`${site.value}/${path}`) : null);
   const about = answered(() => readAt<About>(own("about.json")));
   const rows = answered<NumberArray>(() => arrayAt(ofSite(`${head.value === "mean" ? "rows" : "heads"}/${layer.value}.npy`)));
@@ -216,7 +261,10 @@ export const numReplans = computed(() => about.value.value?.starts.length ?? 0);
 
 /** The episode beside it, in the link as RUN:EPISODE. */
 const besideParts = computed(() => part("beside").split(":"));
-export const beside = sceneOf(computed(() => Number(besideParts.value[0]) || 0), computed(() => besideParts.value[1] ?? ""));
+export const beside = sceneOf(
+  computed(() => Number(besideParts.value[0]) || 0),
+  computed(() => besideParts.value[1] ?? ""),
+);
 
 const startsOf = (scene: Scene): readonly number[] => scene.about.value.value?.starts ?? [];
 /** The place of the last start that is not after a step. */
@@ -259,22 +307,34 @@ export function swap(): void {
 // What a link names and does not exist is put right in the link, too.
 effect(() => {
   if (numReplans.value && part("replan") !== String(replan.value)) setPart({ replan: replan.value });
-  if (part("step") !== "" && (!part("beside") || (numReplans.value && !about.value.pending && !beside.about.value.pending && part("step") !== String(moment.value)))) setPart({ step: part("beside") ? moment.value : "" });
-  if (axes.value) for (const [name, known] of [["layer", layer], ["head", head], ["denoise", denoise]] as const) if (part(name) !== String(known.value)) setPart({ [name]: known.value });
+  if (
+    part("step") !== "" &&
+    (!part("beside") || (numReplans.value && !about.value.pending && !beside.about.value.pending && part("step") !== String(moment.value)))
+  )
+    setPart({ step: part("beside") ? moment.value : "" });
+  if (axes.value)
+    for (const [name, known] of [
+      ["layer", layer],
+      ["head", head],
+      ["denoise", denoise],
+    ] as const)
+      if (part(name) !== String(known.value)) setPart({ [name]: known.value });
   if (runs.value.value && part("run") !== String(runNumber.value)) setPart({ run: runNumber.value });
 });
-
-export const effects = answered<Effects | null>(() => (about.value.value?.effects ? readJson<Effects | null>(`${address.episode(runNumber.value, episodeName.value)}/effects.json`) : null));
 
 /** What is on the screen: the episode, and the one beside it. */
 export interface Side {
   readonly scene: Scene;
   readonly at: number;
 }
-export const sides = computed<readonly Side[]>(() => [{ scene: main, at: replan.value }, ...(beside.about.value.value ? [{ scene: beside, at: besideReplan.value }] : [])]);
+export const sides = computed<readonly Side[]>(() => [
+  { scene: main, at: replan.value },
+  ...(beside.about.value.value ? [{ scene: beside, at: besideReplan.value }] : []),
+]);
 
 /** In an exchange an episode is known by what it was told, and where. */
-export const nameInRun = (line: EpisodeLine): string => (line.scene == null ? `episode ${line.episode}` : `told '${line.told}', scene ${line.scene}`);
+export const nameInRun = (line: EpisodeLine): string =>
+  line.scene == null ? `episode ${line.episode}` : `told '${line.told}', scene ${line.scene}`;
 
 /** As "told.zarr, task 1, episode 3". */
 export function fullNameOf({ scene }: Side): string {
@@ -297,51 +357,22 @@ export function eventsOf(scene: Scene): readonly EpisodeEvent[] {
   if (!episode) return [];
   const leaves = scene.run.value === runNumber.value ? runNumbers.value?.leaves?.[episode.name] : undefined;
   if (leaves === undefined) return episode.events;
-  const own: EpisodeEvent = { step: leaves, replan: placeAt(episode.starts, leaves), kind: "leaves", text: "leaves the solved episodes", thing: "" };
+  const own: EpisodeEvent = {
+    step: leaves,
+    replan: placeAt(episode.starts, leaves),
+    kind: "leaves",
+    text: "leaves the solved episodes",
+    thing: "",
+  };
   return [...episode.events, own].sort((a, b) => a.step - b.step);
 }
-
-/** What was taken away or exchanged, by name: read by nobody, or where that was not tried, not by the action queries. */
-const tried = computed(() => {
-  const found = new Map<string, Effect>();
-  for (const reader of [null, "direct", "total"]) {
-    for (const one of effects.value.value?.items ?? []) if (one.reader === reader && ["without", "prompt", "image"].includes(one.kind)) found.set(one.label, one);
-  }
-  return found;
-});
-
-/** What words are shaded by: attention, effect (of this replan), effects (over the episode); the effect where it was recorded. */
-export const shade = computed<"attention" | "effect" | "effects">(() => {
-  const given = part("words");
-  if (given === "attention" || !effects.value.value?.items.length) return "attention";
-  return given === "effects" ? "effects" : "effect";
-});
-
-/** How far the action moves: at this replan, or over the episode where that is what words are shaded by. */
-export const sizeOf = (effect: Effect | null | undefined): number => (shade.value === "effects" ? effect?.mean : effect?.effect[replan.value]) ?? NaN;
-
-/** Another noise seed, which no item is. */
-export const seed = computed(() => effects.value.value?.items.find(({ kind }) => kind === "noise"));
-
-/** All of them and the noise, the largest effect first. */
-export const ranked = computed(() => {
-  const known = [...tried.value.values(), ...(seed.value ? [seed.value] : [])];
-  return tried.value.size ? known.sort((a, b) => (sizeOf(b) || 0) - (sizeOf(a) || 0)) : [];
-});
-
-/** The effect of a word; effects name words in lower case. */
-export function effectOfWord(text: string): Effect | null {
-  const isIt = (one: Effect): boolean => one.kind === "without" && one.item_kind === "word" && one.item === text.toLowerCase();
-  return [...tried.value.values()].find(isIt) ?? null;
-}
-
-/** What is taken away: the changed actions are drawn beside the executed ones. */
-export const taken = computed<Effect | null>(() => tried.value.get(part("without")) ?? null);
 
 /** The link's text of what is picked. */
 export function groupOf(changes: Partial<Picked>): string {
   const { cells, words: chosen, selector } = { ...picked.peek(), ...changes };
-  const parts = Object.entries(cells).filter(([, some]) => some.length).map(([camera, some]) => `${camera}:${some.join(".")}`);
+  const parts = Object.entries(cells)
+    .filter(([, some]) => some.length)
+    .map(([camera, some]) => `${camera}:${some.join(".")}`);
   if (chosen.length) parts.push(`words:${chosen.join(".")}`);
   if (selector) parts.push(`=${selector.replaceAll(";", " ")}`);
   return parts.join(";");
@@ -360,14 +391,16 @@ export function hasCells(scene: Scene, camera: string): boolean {
 }
 
 /** The picked cells of a camera; in the episode beside it the same. */
-export const cellsOf = (scene: Scene, camera: string): readonly number[] => (hasCells(scene, camera) ? (picked.value.cells[camera] ?? []) : []);
+export const cellsOf = (scene: Scene, camera: string): readonly number[] =>
+  hasCells(scene, camera) ? (picked.value.cells[camera] ?? []) : [];
 
 /** The keys of the picked cells and of a typed selector (`seen`), and of the words at the picked places (`read`). */
 export function pickedKeys({ scene, at }: Side): { seen: Keys; read: Keys } {
   const seen: Keys = new Map();
   for (const [camera, how] of Object.entries(scene.layout.value?.cameras ?? {})) {
     const wanted = new Set(cellsOf(scene, camera));
-    how.keys.forEach((key, i) => wanted.has(how.cells[i]!) && seen.set(key, Math.min(1, (seen.get(key) ?? 0) + (how.shares?.[i] ?? 1))));
+    for (const [i, key] of how.keys.entries())
+      if (wanted.has(how.cells[i]!)) seen.set(key, Math.min(1, (seen.get(key) ?? 0) + (how.shares?.[i] ?? 1)));
   }
   const ofReplans = scene.typed.value.value?.keys ?? [];
   for (const [key, weight] of ofReplans[at] ?? ofReplans[0] ?? []) seen.set(key, weight);

@@ -34,7 +34,7 @@ export function sumOf(masses: ArrayLike<number>, keys: Iterable<readonly [number
 /** Masses of keys as cells of a camera's map. */
 export function cellSums(masses: ArrayLike<number>, { rows, columns, keys, cells, shares }: CameraLayout): Float64Array {
   const sums = new Float64Array(rows * columns);
-  keys.forEach((key, i) => (sums[cells[i]!]! += masses[key]! * (shares ? shares[i]! : 1)));
+  for (const [i, key] of keys.entries()) sums[cells[i]!]! += masses[key]! * (shares ? shares[i]! : 1);
   return sums;
 }
 
@@ -45,7 +45,11 @@ export function cellLifts(masses: ArrayLike<number>, uniform: ArrayLike<number>,
 }
 
 /** Lines around the cells for which `inside` holds, as a path in units of cells, or of so many pixels a cell. */
-export function outline({ rows, columns }: { rows: number; columns: number }, inside: (cell: number) => boolean, [wide, high]: readonly [number, number] = [1, 1]): string {
+export function outline(
+  { rows, columns }: { rows: number; columns: number },
+  inside: (cell: number) => boolean,
+  [wide, high]: readonly [number, number] = [1, 1],
+): string {
   const parts: string[] = [];
   const holds = (row: number, column: number): boolean =>
     row >= 0 && row < rows && column >= 0 && column < columns && inside(row * columns + column);
@@ -96,4 +100,18 @@ export function scaleEnd(lifts: readonly number[]): number {
   const high = Math.max(4, below + (at - Math.floor(at)) * (above - below) || 0);
   const step = 10 ** (Math.floor(Math.log10(high)) - 1);
   return Math.ceil(Number((high / step).toFixed(9))) * step;
+}
+
+/** The mean of lists of numbers, place by place, of what is there; NaN where nothing is. */
+export function meanOf(lists: readonly (readonly number[])[]): number[] {
+  return range(Math.max(0, ...lists.map(({ length }) => length))).map((i) => {
+    const known = lists.map((list) => list[i]!).filter(Number.isFinite);
+    return known.reduce((a, b) => a + b, 0) / known.length;
+  });
+}
+
+/** How strongly a change of the action is coloured, 0 to 1: by the part that moves most for what is `full` there. Parts that
+ * move no more than by another noise seed do not count. */
+export function strengthOf(sizes: readonly number[], noise: readonly number[], full: readonly number[]): number {
+  return Math.max(0, ...sizes.map((size, i) => (size > (noise[i] || 0) ? Math.min(1, size / full[i]!) : 0)));
 }

@@ -1,7 +1,9 @@
-/** The instruction as a title: its words shaded by attention or by effect, and what is known of the picked one. */
+/** The instruction as a title: its words shaded by what they do or by attention, and what is known of the picked ones. */
 import { computed } from "@preact/signals";
 
-import { about, effectOfWord, effects, groupOf, massesAt, picked, replan, seed, setPart, shade, sizeOf, step, toggled, uniformAt, words } from "./state";
+import { EffectsOfWords, effects, exchangesKnown, noise, ofWord, said, shade, strength } from "./effects";
+import { Hint } from "./hint";
+import { about, groupOf, massesAt, picked, replan, setPart, step, toggled, uniformAt, words } from "./state";
 import { percent, shown, sumOf } from "./sums";
 
 const once = (keys: readonly number[]): [number, number][] => keys.map((key) => [key, 1]);
@@ -13,24 +15,33 @@ function liftOf(keys: readonly number[], at: number): number {
 }
 
 interface Shaded {
-  readonly strength: number;
-  /** Not more than another noise seed. */
+  /** Of the colour, and of the line below, 0 to 1. */
+  readonly colour: number;
+  readonly line: number;
+  /** Tried, and not more than another noise seed. */
   readonly none: boolean;
   readonly title: string;
 }
 
+/** Words are coloured by what another word in their place does, and a line says what leaving them out does; where none was
+ * exchanged, that is the colour. */
 const shades = computed<readonly Shaded[]>(() => {
-  const values = words.value.map(({ text, keys }) => {
-    const effect = effectOfWord(text);
-    return { lift: liftOf(keys, replan.value), effect: sizeOf(effect), noise: sizeOf(seed.value) };
-  });
-  const of = (one: (typeof values)[0]): number => (shade.value === "attention" ? one.lift : one.effect);
-  const highest = Math.max(shade.value === "attention" ? 4 : 0, ...values.map(of).filter(Number.isFinite));
-  return values.map((one) => {
-    const none = shade.value !== "attention" && !(of(one) > one.noise);
-    const read = `attention per token: ${shown(one.lift)} times even`;
-    const moved = Number.isFinite(one.effect) ? `; without it ${effects.value.value?.said.replace("{}", shown(one.effect))} (another noise seed: ${shown(one.noise)})` : "";
-    return { strength: none || !Number.isFinite(of(one)) ? 0 : Math.max(0, of(one) / highest), none, title: `${read}${moved}` };
+  const lifts = words.value.map(({ keys }) => liftOf(keys, replan.value));
+  const highest = Math.max(4, ...lifts.filter(Number.isFinite));
+  return words.value.map(({ text }, i) => {
+    const { removed, exchanged, others } = ofWord(text);
+    const lift = lifts[i]!;
+    const title = [
+      `attention per token: ${shown(lift)} times even`,
+      exchanged.length ? `as ${others}: ${said(exchanged)}` : "",
+      removed.length ? `left out: ${said(removed)}` : "",
+      removed.length + exchanged.length && noise.value.length ? `another noise seed: ${said(noise.value)}` : "",
+    ];
+    const own = { title: title.filter(Boolean).join("; "), none: false, line: 0 };
+    if (shade.value === "attention") return { ...own, colour: Math.max(0, (lift || 0) / highest) };
+    const line = exchangesKnown.value ? strength(removed) : 0;
+    const colour = strength(exchangesKnown.value ? exchanged : removed);
+    return { ...own, line, colour, none: !colour && !line && removed.length + exchanged.length > 0 };
   });
 });
 
@@ -38,7 +49,7 @@ const shades = computed<readonly Shaded[]>(() => {
 function toggle(place: number): void {
   const chosen = toggled(picked.value.words, place);
   const last = chosen.includes(place) ? place : chosen.at(-1);
-  step({ group: groupOf({ words: chosen }), without: last === undefined ? "" : (effectOfWord(words.value[last]!.text)?.label ?? "") });
+  step({ group: groupOf({ words: chosen }), without: last === undefined ? "" : ofWord(words.value[last]!.text).label });
 }
 
 export function Title() {
@@ -48,45 +59,90 @@ export function Title() {
   return (
     <div class="title">
       <h1>
-        {words.value.length ? words.value.map(({ text }, i) => (
-          <button
-            key={i} class={`word${shades.value[i]!.none ? " none" : ""}`} aria-pressed={chosen.includes(i)} title={shades.value[i]!.title}
-            style={{ "--strength": shades.value[i]!.strength.toFixed(3) }} onClick={() => toggle(i)}
-          >{text}</button>
-        )) : episode.told}
+        {words.value.length
+          ? words.value.map(({ text }, i) => {
+              const { colour, line, none, title } = shades.value[i]!;
+              return (
+                <button
+                  key={i}
+                  class={`word${none ? " none" : ""}`}
+                  aria-pressed={chosen.includes(i)}
+                  title={title}
+                  style={{ "--strength": colour.toFixed(3), "--line": line.toFixed(3) }}
+                  onClick={() => toggle(i)}
+                >
+                  {text}
+                </button>
+              );
+            })
+          : episode.told}
       </h1>
-      {shades.value.length && shades.value.every(({ none }) => none) ? <span class="soft">no word moves the action more than another noise seed does</span> : null}
+      {shades.value.length && shades.value.every(({ none }) => none) ? (
+        <span class="soft">no word moves the action more than another noise seed does</span>
+      ) : null}
       {effects.value.error ? <span class="soft">{effects.value.error}</span> : null}
     </div>
   );
 }
 
 const SHADES = { effect: "effect now", effects: "effect, whole episode", attention: "attention" } as const;
+const HINTS = {
+  exchanged:
+    "Colour: how far the action moves with another word in its place. Line below: with the word left out, an input that the policy never saw. Dotted: tried, and no more than another noise seed.",
+  removed:
+    "Colour: how far the action moves with the word left out, an input that the policy never saw; no exchange was recorded. Dotted: tried, and no more than another noise seed.",
+};
 
 /** What the words are shaded by. */
 export function ChooseShade() {
-  if (!effects.value.value?.items.length) return <span class="soft">words shaded by attention per token</span>;
+  const known = effects.value.value;
+  if (!known?.items.length) return <span class="soft">words shaded by attention per token</span>;
+  const full = known.parts.flatMap((one) =>
+    one.full === null ? [] : [one.said.replace("{}", one.share ? percent(one.full) : shown(one.full))],
+  );
+  const scale = full.length ? ` Full: ${full.join(", or ")}.` : "";
   return (
-    <span class="shades" role="group" aria-label="Words shaded by">words by{" "}
-      {Object.entries(SHADES).map(([name, title]) => <button key={name} class="chip" aria-pressed={shade.value === name} onClick={() => setPart({ words: name })}>{title}</button>)}
-    </span>
+    <fieldset class="shades" aria-label="Words shaded by">
+      words by{" "}
+      {Object.entries(SHADES).map(([name, title]) => (
+        <button key={name} class="chip" aria-pressed={shade.value === name} onClick={() => setPart({ words: name })}>
+          {title}
+        </button>
+      ))}
+      <Hint text={`${exchangesKnown.value ? HINTS.exchanged : HINTS.removed}${scale}`} />
+    </fieldset>
   );
 }
 
-/** What the picked words get. */
+/** What the picked words get, and what they do. */
 export function AboutWords() {
   const chosen = picked.value.words.filter((i) => words.value[i]);
   const mass = massesAt(replan.value);
   if (!chosen.length) return null;
   return (
-    <table class="numbers">
-      <thead><tr><th>word</th><th>attention</th><th>per token</th></tr></thead>
-      <tbody>
-        {chosen.map((i) => {
-          const { text, keys } = words.value[i]!;
-          return <tr key={i}><th>{text}</th><td>{percent(mass && sumOf(mass, once(keys)))}</td><td>{shown(liftOf(keys, replan.value))} times even</td></tr>;
-        })}
-      </tbody>
-    </table>
+    <section class="about-words" aria-label="Picked words">
+      <table class="numbers">
+        <thead>
+          <tr>
+            <th>word</th>
+            <th>attention</th>
+            <th>per token</th>
+          </tr>
+        </thead>
+        <tbody>
+          {chosen.map((i) => {
+            const { text, keys } = words.value[i]!;
+            return (
+              <tr key={i}>
+                <th>{text}</th>
+                <td>{percent(mass && sumOf(mass, once(keys)))}</td>
+                <td>{shown(liftOf(keys, replan.value))} times even</td>
+              </tr>
+            );
+          })}
+        </tbody>
+      </table>
+      <EffectsOfWords texts={chosen.map((i) => words.value[i]!.text)} />
+    </section>
   );
 }
