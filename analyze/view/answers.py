@@ -2,6 +2,7 @@
 
 runs.json                                   every run with its episodes
 runs/0/numbers.json                         of a run: what is computed meanwhile (`summaries`)
+runs/0/heads.json?site=&layer=&selector=&first=     how much every head of a layer looks at something, of some episodes
 runs/0/EPISODE/about.json                   what happened, and what every key is
 runs/0/EPISODE/effects.json                 how the action changes without a word, an object, a picture
 runs/0/EPISODE/actions/NUMBER.npy           the actions of the calls of one effect
@@ -9,6 +10,7 @@ runs/0/EPISODE/pictures/CAMERA/REPLAN.png   film.gif: all of them, with the atte
                                             ?site=&layer=&head=&denoise= as they are shown
 runs/0/EPISODE/SITE/objects.json            which cells of the pictures objects cover
 runs/0/EPISODE/SITE/rows/LAYER.npy          rows of a layer, or of the mean of all; heads/LAYER.npy: of every head
+runs/0/EPISODE/SITE/call/LAYER/REPLAN.json  what every head of a layer looks at in one call
 runs/0/EPISODE/SITE/uniform/LAYER.npy       what uniform attention gives in their place
 runs/0/EPISODE/SITE/groups/DENOISE/HEAD.json    ratio and masses of the grouping `default`; `mean`: of all
 runs/0/EPISODE/SITE/grid/NUMBER.json        mass and lift in every head of one of the site's `targets`
@@ -28,10 +30,11 @@ from typing import Any, TypeAlias
 from vla_attention.analyze.core.action_changes import ActionUnits, units_of
 from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, npy
+from vla_attention.analyze.view.head_answers import heads_of_run
 from vla_attention.analyze.view.paths import RUNS, NothingThere
 from vla_attention.analyze.view.run_answers import KnownLines, runs_answer
 from vla_attention.analyze.view.served_stores import ServedStore
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError, unknown_name
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 JSON, PNG, NPY = "application/json", "image/png", "application/octet-stream"
@@ -64,11 +67,13 @@ class Answers:
         try:
             _, number, episode, *rest = names
             served = stores[int(number)]
-            if episode == "numbers.json" and not rest:
-                return _json(served.summary.document())
-            shown = self._shown(served.store, episode)
         except (ValueError, IndexError):
             raise NothingThere from None
+        if [episode, *rest] == ["numbers.json"]:
+            return _json(served.summary.document())
+        if [episode, *rest] == ["heads.json"]:
+            return _json(_heads_of_run(served.store, query))
+        shown = self._shown(served.store, episode)
         match rest:
             case ["about.json"]:
                 return _json(shown.about())
@@ -159,6 +164,8 @@ def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mappin
             return _json(shown.covered(site))
         case ["rows" | "heads" as kind, file] if file.endswith(".npy"):
             return npy(shown.rows(site, file.removesuffix(".npy"), heads=kind == "heads")), NPY
+        case ["call", layer, file]:
+            return _json(shown.call(site, layer, _number(file, ".json")))
         case ["uniform", file] if file.endswith(".npy"):
             return npy(shown.uniform(site, file.removesuffix(".npy"))), NPY
         case ["groups", denoise, file] if file.endswith(".json"):
@@ -174,6 +181,16 @@ def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mappin
     raise NothingThere
 
 
+def _heads_of_run(store: Store, query: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    if sorted(query) != ["first", "layer", "selector", "site"] or any(len(values) != 1 for values in query.values()):
+        raise BadArgument("Expected ?site=SITE&layer=NUMBER&selector=SELECTOR&first=EPISODE here.")
+    given = {name: values[0] for name, values in query.items()}
+    if given["site"] not in [site.name for site in store.attributes.sites]:
+        raise unknown_name("site", given["site"], [site.name for site in store.attributes.sites])
+    layer, first = (_number(given[name], "") for name in ("layer", "first"))
+    return heads_of_run(store, given["site"], layer, given["selector"], first)
+
+
 def error_answer(sentence: object) -> Content:
     """What is said where there is no answer."""
     return _json({"error": str(sentence)})
@@ -185,7 +202,7 @@ def _json(document: Any) -> Content:
 
 def _number(file: str, ending: str) -> int:
     stem = file.removesuffix(ending)
-    if stem == file or not stem.isdecimal() or len(stem) > 9:
+    if (ending and stem == file) or not stem.isdecimal() or len(stem) > 9:
         raise NothingThere
     return int(stem)
 

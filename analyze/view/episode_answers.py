@@ -45,6 +45,7 @@ from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
 from vla_attention.schemas.episode_steps import GRIPPER as FINGERS
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import check_names
+from vla_attention.schemas.groupings.selectors import quoted
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -204,7 +205,7 @@ class ShownEpisode:
         steps = None if denoise == MEAN else (denoise,)
         settings = AnalysisSettings(layers=layers, heads=heads, denoise=steps, site=site)
         seen = [thing.name for thing in self.item(self._site_names[0]).tokens.objects if thing.name in self.named]
-        outlines = [f"{_IN_NAMES.sub('_', name)}=object:{_quoted(name)}" for name in seen]
+        outlines = [f"{_IN_NAMES.sub('_', name)}=object:{quoted(name)}" for name in seen]
         options = {"episode": number, "video": "gif", "outline": outlines}
         result = answer_to("overlay", [only], settings, options)
         ((name, write),) = result.files.items()
@@ -260,6 +261,31 @@ class ShownEpisode:
         for i, j in product(range(len(selection.layers)), range(len(selection.denoise))):
             rows = self._read[site][selection.layers[i], selection.denoise[j]]
             yield LayerRows(i, j, range(rows.shape[-1]), rows)
+
+    def call(self, site: str, layer: str, replan: int) -> dict[str, Any]:
+        """`call/LAYER/REPLAN.json`: what every head of a layer looks at in one call, and where the named objects are.
+
+        lift: times even attention of the cells of a camera's map, (head, cell), mean over denoise steps; named: cells.
+        """
+        item, at = self.item(site), check_replan(self.item(site), replan)
+        rows = self.rows(site, layer, heads=True)[at].mean(axis=0)  # (head, key)
+        uniform = self.uniform(site, layer).mean(axis=1)
+        even = uniform[min(at, len(uniform) - 1)]
+        cameras = {}
+        for camera in seen_cameras(item):
+            picture, view = PictureMap.of(item.tokens.layout, camera), view_of(item, camera)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                lift = picture.spread(rows[:, picture.keys]) / picture.spread(even[picture.keys])
+            shown = [upright(one, view).ravel() for one in lift]
+            covered = self.covered(site).get(camera, {})
+            cameras[camera] = {
+                "rows": picture.rows,
+                "columns": picture.columns,
+                "stored": self.episode.has(f"frames/{camera}"),
+                "lift": _numbers(np.array(shown)),
+                "named": sorted({cell for name in self.named & covered.keys() for cell in covered[name][at]}),
+            }
+        return cameras
 
     def read_ahead(self, site: str, heads: bool) -> None:
         """Read all layers and what all heads look at, for who asks for all of it: each chunk is decoded once."""
@@ -323,7 +349,7 @@ class ShownEpisode:
             (one for one in item.tokens.objects if one.name in seen), key=lambda one: one.name not in self.named
         )
         found = [
-            (visible(one.name.replace("_", " ")) + " (named)" * (one.name in self.named), f"object:{_quoted(one.name)}")
+            (visible(one.name.replace("_", " ")) + " (named)" * (one.name in self.named), f"object:{quoted(one.name)}")
             for one in things
         ]
         if seen_cameras(item):
@@ -331,7 +357,7 @@ class ShownEpisode:
         words = {word.text.casefold(): word.text for line in item.tokens.words for word in line}
         if words:
             found.append(("the instruction", "role:instruction"))
-        found += [(f"'{visible(text)}'", f"word:{_quoted(text)}") for text in words.values()]
+        found += [(f"'{visible(text)}'", f"word:{quoted(text)}") for text in words.values()]
         return [{"name": name, "selector": selector} for name, selector in found]
 
     def grid(self, site: str, selector: str) -> dict[str, Any]:
@@ -445,11 +471,6 @@ def _grid(question: Question, rows: pl.DataFrame) -> dict[str, Any]:
         "heads": list(selection.head_numbers),
         **{name: _numbers(rows[name].to_numpy().reshape(shape), exact=True) for name in ("mass", "lift")},
     }
-
-
-def _quoted(name: str) -> str:
-    """A name as selectors have it; names that need quotes have one kind of them at most (`check_name`)."""
-    return f"'{name}'" if '"' in name else f'"{name}"'
 
 
 def _camera(item: SelectedEpisode, camera: str) -> dict[str, Any]:

@@ -52,6 +52,11 @@ class SelectorKind:
     has_keys: Callable[[Vocabulary], bool] = lambda names: True
 
 
+def quoted(name: str) -> str:
+    """A name as selectors have it; names that need quotes have one kind of them at most (`check_name`)."""
+    return f"'{name}'" if '"' in name else f'"{name}"'
+
+
 def num_cells(tokens: EpisodeTokens) -> int:
     """Cells of a key: what no object covers, one for each object, and what of a patch shows no picture."""
     return 1 + len(tokens.objects) + (tokens.border is not None)

@@ -29,6 +29,7 @@ from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, s
 from vla_attention.analyze.measures.question import ask as question_of
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.render.style import group_styles
+from vla_attention.analyze.view import head_answers
 from vla_attention.analyze.view.answers import Answers
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, _closings
 from vla_attention.schemas.episode_steps import TaskGoal
@@ -175,6 +176,59 @@ def test_targets_of_heads_are_selectors(server):
         own = read(server, "joint", f"joint/grid/{number}.json")
         assert own == read(server, "joint", f"joint/grid.json?selector={quote(target['selector'])}")
     assert number > 3
+
+
+def of_run(server, layer: int, selector: str, first: int = 0) -> Any:
+    query = f"site=joint&layer={layer}&selector={quote(selector)}&first={first}"
+    return read_path(server, f"runs/{NAMES.index('steps')}/heads.json?{query}")
+
+
+def test_a_head_over_the_run_is_what_the_grids_of_its_episodes_say(server, places, monkeypatch):
+    monkeypatch.setattr(head_answers, "_AT_ONCE", 1)
+    store = open_store(places["steps"])
+    layer, names = store.attributes.recording.layer_labels[-1], [one.name for one in store.episodes]
+    for selector in ("role:instruction", 'object:"plate_1"', "word:bowl"):
+        found: dict[str, Any] = {}
+        for first in range(len(names)):
+            given = of_run(server, layer, selector, first)
+            assert given["next"] == (first + 1 if first + 1 < len(names) else None)
+            found |= {one["name"]: one for one in given["episodes"]}
+        assert set(found) == set(names)
+        for number, name in enumerate(names):
+            grid = read(server, "steps", f"joint/grid.json?selector={quote(selector)}", number)
+            expected = numbers(grid["lift"])[:, grid["layers"].index(layer)]
+            np.testing.assert_allclose(numbers(found[name]["lift"]), expected, rtol=1e-6)
+            np.testing.assert_allclose(numbers(found[name]["layer"]), expected.mean(axis=1), rtol=1e-4)
+    things = [thing["name"] for thing in read(server, "steps", "about.json")["objects"] if thing["named"]]
+    assert len(things) > 1
+    same = of_run(server, layer, " | ".join(f'object:"{name}"' for name in things))
+    assert of_run(server, layer, "named") == same
+    assert of_run(server, layer, "word:nothing")["episodes"] == []
+
+
+def test_what_heads_look_at_in_a_call_is_of_their_rows(server):
+    about = read(server, "joint", "about.json")
+    layer = read_path(server, "runs.json")["runs"][0]["sites"][0]["layers"][0]
+    rows = read(server, "joint", f"joint/heads/{layer}.npy").mean(axis=1)[2]  # (head, key)
+    even = read(server, "joint", f"joint/uniform/{layer}.npy").mean(axis=1)
+    given, covered = read(server, "joint", f"joint/call/{layer}/2.json"), read(server, "joint", "joint/objects.json")
+    for camera, how in about["sites"]["joint"]["cameras"].items():
+        keys = np.array(how["keys"])[np.argsort(how["cells"])]
+        np.testing.assert_allclose(
+            numbers(given[camera]["lift"]), rows[:, keys] / even[min(2, len(even) - 1), keys], rtol=1e-4
+        )
+        things = [thing["name"] for thing in about["objects"] if thing["named"]]
+        expected = {cell for name in things for cell in covered[camera].get(name, [[]] * 3)[2]}
+        assert set(given[camera]["named"]) == expected
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["", "?site=joint&layer=0&selector=named", "?site=no&layer=0&selector=named&first=0",
+     "?site=joint&layer=99&selector=named&first=0", "?site=joint&layer=0&selector=word:&first=0"],
+)  # fmt: skip
+def test_a_question_about_heads_that_has_no_answer_is_a_sentence(server, query):
+    assert json.loads(ask(server, f"runs/0/heads.json{query}").body)["error"]
 
 
 def test_keys_of_a_selector_and_what_is_wrong_with_one(server):

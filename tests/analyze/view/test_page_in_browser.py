@@ -186,6 +186,34 @@ def test_both_episodes_have_heads_and_the_own_group(view, server, store):
     assert shown == pytest.approx(cells["mass"].to_list(), rel=2**-10)
 
 
+def test_from_the_grid_to_a_head_over_all_episodes_and_back_to_a_call(view, server):
+    view.open(f"{server.link}{FIRST}&layer=2&head=1&target=role:instruction")
+    assert view.page.locator(".heads select").input_value() == "role:instruction"
+    view.page.get_by_text("layer 2, head 1 in all episodes").click()
+    view.wait_for_link("of=head")
+    assert "target=role%3Ainstruction" in view.page.url
+    view.page.wait_for_selector(".of-calls .card:nth-child(12) .stack img")
+    query = "site=joint&layer=2&selector=role:instruction&first=0"
+    answer = json.loads(ask(server, f"runs/0/heads.json?{query}").body)
+    lifts = {one["name"]: [line[1] for line in one["lift"]] for one in answer["episodes"]}
+    expected = np.mean([np.mean(of) for of in lifts.values()])
+    assert view.value("[data-number=head-lift]") == pytest.approx(expected, rel=1e-9)
+    shown = [float(text.split()[0]) for text in view.page.locator(".of-calls b").all_inner_texts()]
+    assert len(shown) == 12
+    assert shown == sorted(shown, reverse=True)
+    view.page.get_by_text("least first").click()
+    view.page.locator(".of-calls .card").first.click()
+    view.wait_for_link("episode=")
+    name, replan = min(((name, at) for name in lifts for at in range(3)), key=lambda one: lifts[one[0]][one[1]])
+    link = view.page.url
+    assert f"episode={name}" in link
+    assert ("replan" in link) == (replan > 0)
+    assert {"layer=2", "head=1", "target=role%3Ainstruction"} <= set(link.split("#")[1].split("&"))
+    view.page.get_by_text("all heads of layer 2").click()
+    view.page.wait_for_selector(".layer-maps .stack img")
+    assert view.page.locator(".layer-maps > button[aria-pressed=true]").inner_text().strip() == "head 1"
+
+
 def test_the_overview_finds_episodes(view, server, store):
     view.open(server.link)
     episodes = va.open(store).episodes

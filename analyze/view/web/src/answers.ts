@@ -150,6 +150,17 @@ export interface HeadLifts {
   readonly lift: readonly Grid[];
 }
 
+/** Of some episodes of a run, those in which a selector has keys in sight: lift (replan, head), and that of the layer (replan). */
+export interface HeadsOfRun {
+  readonly heads: readonly number[];
+  readonly episodes: readonly { name: string; lift: Grid; layer: readonly (number | null)[] }[];
+  /** Where the next answer begins. */
+  readonly next: number | null;
+}
+
+/** What every head of a layer looks at in one call, by camera: lift (head, cell), and the cells of the named objects. */
+export type CallMaps = Readonly<Record<string, { rows: number; columns: number; stored: boolean; lift: Grid; named: readonly number[] }>>;
+
 export interface Effect {
   readonly condition: string;
   readonly number: number;

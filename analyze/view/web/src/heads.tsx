@@ -1,8 +1,26 @@
 /** Which head looks at something: layers x heads, for an object, the pictures, a word, or what was picked. */
 import { computed, signal } from "@preact/signals";
-
 import { address, type HeadLifts, readJson } from "./answers";
-import { answered, beside, cellsOf, head, layer, main, nameOf, picked, runs, type Scene, type Side, setPart, sides, site } from "./state";
+import { LayerMaps, NAMED } from "./head";
+import {
+  answered,
+  beside,
+  cellsOf,
+  head,
+  layer,
+  main,
+  nameOf,
+  part,
+  picked,
+  replan,
+  runs,
+  type Scene,
+  type Side,
+  setPart,
+  sides,
+  site,
+  step,
+} from "./state";
 import { shown } from "./sums";
 
 interface Target {
@@ -28,8 +46,13 @@ function targetsOf(scene: Scene): readonly Target[] {
   ];
 }
 
-const chosen = signal<string | null>(null);
-const target = computed(() => targetsOf(main).find(({ id }) => id === chosen.value) ?? targetsOf(main)[0] ?? null);
+/** What the link names: one of them, or another selector; `NAMED` is the first one that the sentence names. */
+const target = computed<Target | null>(() => {
+  const [known, id] = [targetsOf(main), part("target")];
+  const given = known.find((one) => one.id === id);
+  if (given || ["", NAMED, "patches"].includes(id)) return given ?? known[0] ?? null;
+  return runs.value.value?.copy ? (known[0] ?? null) : { id, name: id, path: asked(id) };
+});
 
 const liftsOf = (scene: Scene) =>
   answered<HeadLifts>(() => {
@@ -56,7 +79,7 @@ function Grid({ side, highest }: { side: Side; highest: number }) {
   const best = Math.max(...known(side));
   const place = grid.flatMap((line, i) => line.flatMap((one, j) => (one === best ? [[i, j] as const] : [])))[0];
   const has = runs.value.value?.copy?.heads !== false;
-  const toggle = (own: number, ofHead: number): void => {
+  const toggle = (own: number, ofHead: number | "mean"): void => {
     const same = layer.value === own && head.value === ofHead;
     setPart({ layer: same ? "mean" : own, head: same ? "mean" : ofHead });
   };
@@ -72,7 +95,16 @@ function Grid({ side, highest }: { side: Side; highest: number }) {
         <tbody>
           {grid.map((line, i) => (
             <tr key={i}>
-              <th scope="row">{numbers.layers[i]}</th>
+              <th scope="row">
+                <button
+                  disabled={!has}
+                  aria-pressed={layer.value === numbers.layers[i] && head.value === "mean"}
+                  aria-label={`layer ${numbers.layers[i]}`}
+                  onClick={() => toggle(numbers.layers[i]!, "mean")}
+                >
+                  {numbers.layers[i]}
+                </button>
+              </th>
               {line.map((one, j) => {
                 const about = `layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`;
                 return (
@@ -104,8 +136,8 @@ export function HeadGrid() {
     <section class="heads" aria-label="Heads">
       <label>
         Which head looks at{" "}
-        <select value={target.value.id} onChange={(event) => (chosen.value = event.currentTarget.value)}>
-          {targetsOf(main).map(({ id, name }) => (
+        <select value={target.value.id} onChange={(event) => setPart({ target: event.currentTarget.value })}>
+          {(targetsOf(main).includes(target.value) ? targetsOf(main) : [target.value, ...targetsOf(main)]).map(({ id, name }) => (
             <option value={id}>{name}</option>
           ))}
         </select>{" "}
@@ -118,8 +150,44 @@ export function HeadGrid() {
       </div>
       <p class="soft">
         rows: layers; columns: heads; full colour: {shown(highest)} times even.{" "}
-        {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone."}
+        {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone, or that layer."}
       </p>
+      {runs.value.value?.copy || layer.value === "mean" ? null : <OfLayer />}
     </section>
+  );
+}
+
+const opened = signal(false);
+
+/** Further looks at the chosen layer and head. */
+function OfLayer() {
+  const named = target.value?.name.endsWith("(named)") || target.value?.id === "patches";
+  return (
+    <>
+      <p>
+        <button aria-expanded={opened.value} onClick={() => (opened.value = !opened.value)}>
+          all heads of layer {layer.value} in this call
+        </button>{" "}
+        {head.value === "mean" ? null : (
+          <button
+            onClick={() =>
+              step({
+                episode: "",
+                beside: "",
+                group: "",
+                without: "",
+                step: "",
+                replan: 0,
+                of: "head",
+                target: named ? NAMED : target.value!.id,
+              })
+            }
+          >
+            layer {layer.value}, head {head.value} in all episodes →
+          </button>
+        )}
+      </p>
+      {opened.value ? <LayerMaps name={main.name.value} replan={replan.value} /> : null}
+    </>
   );
 }

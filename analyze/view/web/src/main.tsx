@@ -6,8 +6,25 @@ import "./page.css";
 import { serverGone } from "./answers";
 import { reading } from "./effects";
 import { EpisodePage } from "./episode";
+import { HeadPage, headRead } from "./head";
 import { Overview } from "./overview";
-import { axes, beside, closeEpisode, denoise, episodeName, head, layer, main, mended, playing, run, runs, setPart, walk } from "./state";
+import {
+  axes,
+  beside,
+  closeEpisode,
+  denoise,
+  episodeName,
+  head,
+  layer,
+  main,
+  mended,
+  part,
+  playing,
+  run,
+  runs,
+  setPart,
+  walk,
+} from "./state";
 
 function App() {
   return (
@@ -35,7 +52,8 @@ function Shown() {
       </p>
     );
   if (!runs.value.value) return <p class="soft">Reading …</p>;
-  return episodeName.value ? <EpisodePage /> : <Overview />;
+  if (episodeName.value) return <EpisodePage />;
+  return part("of") === "head" ? <HeadPage /> : <Overview />;
 }
 
 /** The choice before or after this one, the mean before the first. */
@@ -70,7 +88,8 @@ const page = document.getElementById("page")!;
 render(<App />, page);
 effect(() => {
   const line = run.value?.episodes.find(({ name }) => name === episodeName.value);
-  const shown = line ? `task ${line.task}, episode ${line.episode} · ${run.value!.name}` : run.value?.name;
+  const ofHead = part("of") === "head" ? `layer ${layer.value}, head ${head.value} · ${run.value?.name}` : run.value?.name;
+  const shown = line ? `task ${line.task}, episode ${line.episode} · ${run.value!.name}` : ofHead;
   document.title = shown ? `${shown} · Attention` : "Attention";
 });
 // Who walks by keyboard goes on at the beginning of an episode, and behind it at the card that it was opened from.
@@ -85,7 +104,7 @@ effect(() => {
 });
 // For who waits until all is drawn: taken back at once, given when the browser has drawn.
 const ready = computed(
-  () => !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !reading.value)),
+  () => !runs.value.pending && (episodeName.value === "" ? headRead.value : main.ready.value && beside.ready.value && !reading.value),
 );
 const mark = (): void => {
   page.dataset.ready = ready.peek() ? "1" : "";

@@ -98,7 +98,7 @@ export function kindOf(line: EpisodeLine): "solved" | "failed" | "unknown" {
   return line.outcome === true ? "solved" : line.outcome === false ? "failed" : "unknown";
 }
 
-const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·");
+export const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·");
 
 function Card({ line }: { line: EpisodeLine }) {
   const numbers = numbersOf.value.get(line.name);

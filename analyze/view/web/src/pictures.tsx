@@ -102,7 +102,7 @@ export function linesOf({ scene, camera, how, at }: At): { kind: Kind; inside: (
   ];
 }
 
-function Strokes({ kind, path, title }: { kind: Kind; path: string; title?: string }) {
+export function Strokes({ kind, path, title }: { kind: Kind; path: string; title?: string }) {
   return (
     <g class={kind}>
       {STROKES[kind].map(([stroke, width, dash]) => (

@@ -68,6 +68,8 @@ const DEFAULTS = {
   curve: "ratio",
   step: "",
   sort: "task",
+  target: "",
+  of: "",
 } as const;
 export type Part = keyof typeof DEFAULTS;
 
@@ -109,7 +111,18 @@ export function step(changes: Partial<Record<Part, string | number>>): void {
   setPart(changes);
 }
 
-const CLOSED = { episode: "", replan: 0, layer: "mean", head: "mean", denoise: "mean", group: "", without: "", beside: "", step: "" };
+const CLOSED = {
+  episode: "",
+  replan: 0,
+  layer: "mean",
+  head: "mean",
+  denoise: "mean",
+  group: "",
+  without: "",
+  beside: "",
+  step: "",
+  of: "",
+};
 
 /** Shows an episode from its beginning. */
 export function openEpisode(episode: string): void {
