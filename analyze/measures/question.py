@@ -129,7 +129,7 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
     else:
         chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
         if settings.skip_corrupt:
-            chosen, faulty = _without_faulty(chosen)
+            chosen, faulty = without_faulty(chosen)
             skipped += faulty
         names, notes_of_runs = Names(root.site(site)), RunNotes()
 
@@ -196,7 +196,7 @@ def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Groupin
     return (f"These numbers are of {these} only, as --denoise asks.",) if chosen else ()
 
 
-def _without_faulty(
+def without_faulty(
     chosen: Sequence[tuple[Store, StoredEpisode]],
 ) -> tuple[list[tuple[Store, StoredEpisode]], list[str]]:
     """The episodes that are undamaged and hold a replan, and a line on each of the others. Reads everything once."""

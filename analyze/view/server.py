@@ -8,9 +8,11 @@ asking for anything elsewhere, whatever a store holds.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 from vla_attention.analyze.view.answers import Answers, error_answer
 from vla_attention.analyze.view.kept_token import kept_token, new_token
@@ -117,7 +119,12 @@ class ViewerServer(ThreadingHTTPServer):
             if names == [RUNS]:
                 for store in self.stores:
                     store.refresh()
-            return Answer(200, *self._answers.answer(self.stores, names, query))
+            if gone := self._gone(names):
+                return Answer(HTTPStatus.GONE, *error_answer(gone))
+            with ExitStack() as stack:  # what a person waits for goes before the list's numbers
+                for store in self.stores:
+                    stack.enter_context(store.summary.paused())
+                return Answer(200, *self._answers.answer(self.stores, names, query))
         except WrongToken:
             return Answer(403, b"This is the page of vla-attention view: open the whole link that it printed.\n")
         except NothingThere:
@@ -127,8 +134,16 @@ class ViewerServer(ThreadingHTTPServer):
         except UserError as error:
             # A browser logs every other status as an error; a wrong selector is the user's, and the page says it.
             return Answer(HTTPStatus.OK if query else HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
-        except OSError as error:  # the store was moved, or changes
+        except OSError as error:  # the store changes
             return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error.strerror or error))
+
+    def _gone(self, names: Sequence[str]) -> str:
+        """What is said where the store that an address is of is not there any more; empty where it is."""
+        number = names[1] if len(names) > 1 and names[1].isdecimal() and len(names[1]) < 9 else ""
+        place = self.stores[int(number)].store.path if number and int(number) < len(self.stores) else None
+        if not isinstance(place, Path) or place.exists():
+            return ""
+        return f"{place} is not there any more: it was moved or deleted. Put it back, or open another store."
 
 
 def _allowed_host(given: str) -> str:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from vla_attention.schemas.safe_text import visible
@@ -20,7 +21,7 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 _MODULE = "vla_attention.analyze.view.summary_process"
 #: What is said of the whole run.
-_OF_RUN = ("ratio", "findings", "leaves", "failed")
+_OF_RUN = ("ratio", "findings", "leaves", "effects", "effect", "failed")
 #: How a line of the process begins that is for the reader.
 OURS = "summary "
 
@@ -34,6 +35,8 @@ class Summary:
         self._rows: dict[str, dict[str, Any]] = {}
         self._about: dict[str, Any] = dict.fromkeys(_OF_RUN)
         self._complete = False
+        #: Questions that are being answered.
+        self._waiting = 0
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
 
@@ -63,13 +66,33 @@ class Summary:
                 stdin=subprocess.DEVNULL,
                 encoding="utf-8",
                 env=variables,
-                start_new_session=True,  # Ctrl-C is for the server, which then ends this process
+                # Ctrl-C is for the server, which then ends this process. Of the same session: if the server is killed
+                # while this one stands still, the system ends it, too.
+                process_group=0,
             )
         except OSError as error:
             self._fail(f"Python could not be started a second time: {error.strerror or error}.")
             return
         self._reader = threading.Thread(target=self._read, args=(self._process,), daemon=True)
         self._reader.start()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Let the process stand still as long as somebody waits for an answer; not on Windows."""
+        with self._lock:
+            self._waiting += 1
+            self._send("SIGSTOP", when=self._waiting == 1)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._waiting -= 1
+                self._send("SIGCONT", when=self._waiting == 0)
+
+    def _send(self, name: str, when: bool) -> None:
+        process = self._process
+        if when and process is not None and hasattr(signal, name):
+            process.send_signal(getattr(signal, name))
 
     def document(self) -> dict[str, Any]:
         """`NUMBER.summary.json`: the episodes in the store's order; numbers that are not there yet are null."""

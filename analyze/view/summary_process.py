@@ -11,7 +11,7 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,17 +19,23 @@ import polars as pl
 
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.about import sides
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.measures.question import ask
+from vla_attention.analyze.core.listening import listens
+from vla_attention.analyze.core.recorded_effects import recorded_effects
+from vla_attention.analyze.core.result import Finding
+from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask, without_faulty
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.analyze.view.summaries import OURS
+from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import episode_name, parse_episode_name
 
-#: Whose answers are the findings of the run, in this order.
+#: Whose answers are the findings of the run, in this order; those of the second need no rows, and are asked first.
 _QUESTIONS = ("language", "failures", "objects")
+_WITHOUT_ATTENTION = ("failures",)
 #: Episodes that are measured together; their numbers appear together.
 _AT_ONCE = 8
 
@@ -49,13 +55,25 @@ def main(place: str) -> int:
 
 
 def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
-    """The summary of a store in parts: entries of episodes with their numbers, then what is said of all.
+    """The summary of a store in parts: what needs no attention first, then entries of episodes with their numbers.
 
-    An episode that cannot be read, or whose ratio is not defined, has no numbers, and `failed` is why.
+    `findings` are all that are known so far. An episode that cannot be read, or whose ratio is not defined, has no
+    numbers, and `failed` is why.
     """
+    readable = _Readable(store)
+    found: dict[str, list[dict[str, str]]] = {name: [] for name in ("done", *_QUESTIONS)}
+    if done := _done(readable.by_attributes):
+        found["done"] = [done]
+        yield _so_far(found)
+    for name in _WITHOUT_ATTENTION:
+        yield from readable.answer(name, found)
+    yield from _effects(readable)
     for at in range(0, len(store.episodes), _AT_ONCE):
         yield from _entries(store, store.episodes[at : at + _AT_ONCE])
-    yield _findings(store)
+    for name in _QUESTIONS:
+        if name not in _WITHOUT_ATTENTION:
+            yield from readable.answer(name, found)
+    yield _so_far(found)
 
 
 def _entries(store: Store, batch: Sequence[StoredEpisode]) -> Iterator[dict[str, Any]]:
@@ -69,25 +87,91 @@ def _entries(store: Store, batch: Sequence[StoredEpisode]) -> Iterator[dict[str,
                 yield from _entries(store, [episode])
 
 
-def _findings(store: Store) -> dict[str, Any]:
-    """What the commands say of the run, each sentence once; and the steps at which failed episodes leave solved ones.
+class _Readable:
+    """What can be read of a store, and what questions have read of it already."""
 
-    A question that the store cannot answer says nothing.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    leaves: dict[str, int] = {}
-    for name in _QUESTIONS:
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._known: KnownEpisodes = {}
+
+    @property
+    def by_attributes(self) -> Store:
+        """With the episodes whose attributes can be read."""
+        return replace(self._store, episodes=tuple(filter(_has_attributes, self._store.episodes)))
+
+    @cached_property
+    def whole(self) -> Store:
+        """With the episodes that are undamaged; the first question reads everything for it.
+
+        Raises:
+            StoreError: there are none.
+        """
+        kept, _ = without_faulty([(self._store, episode) for episode in self._store.episodes])
+        return replace(self._store, episodes=tuple(episode for _, episode in kept))
+
+    def answer(self, name: str, found: dict[str, list[dict[str, str]]]) -> Iterator[dict[str, Any]]:
+        """What a command says of the run, added to what was found; of `failures` also where failed ones leave others.
+
+        A question that the store cannot answer says nothing.
+        """
         try:
-            result = answer_to(name, [store], AnalysisSettings(skip_corrupt=True))
+            result = answer_to(name, [self.whole], AnalysisSettings(), known=self._known)
         except UserError:
-            continue
-        for one in result.findings:
-            found.setdefault(one.sentence, {"asks": one.asks, "sentence": one.sentence, "limit": one.limit})
+            return
+        found[name] = [*map(_shown, result.findings)]
+        leaves: dict[str, int] = {}
         for table in result.tables:
             if table.name == "failures":
                 rows = table.shown.drop_nulls("step").select("task_id", "episode_index", "step")
                 leaves |= {episode_name(task, episode): step for task, episode, step in rows.iter_rows()}
-    return {"findings": list(found.values()), "leaves": leaves}
+        yield _so_far(found) | ({"leaves": leaves} if name == "failures" else {})
+
+    def question(self) -> Question:
+        """All of it, as the questions ask it."""
+        return ask([self.whole], AnalysisSettings(), self._known)
+
+
+def _has_attributes(episode: StoredEpisode) -> bool:
+    try:
+        return bool(replace(episode).attributes.num_replans)
+    except UserError:
+        return False
+
+
+def _done(store: Store) -> dict[str, str] | None:
+    """Whether the policy did what it was told, which needs attributes alone; None where nobody knows what it did."""
+    asked = with_choices(behaviour((store, episode) for episode in store.episodes))
+    return None if asked.is_empty() else _shown(listens(asked))
+
+
+def _shown(finding: Finding) -> dict[str, str]:
+    return {"asks": finding.asks, "sentence": finding.sentence, "limit": finding.limit}
+
+
+def _so_far(found: Mapping[str, Sequence[dict[str, str]]]) -> dict[str, Any]:
+    """Every sentence once; what was done stands first until `language` says it, too."""
+    each = [one for findings in found.values() for one in findings]
+    return {"findings": list({one["sentence"]: one for one in each}.values())}
+
+
+def _effects(readable: _Readable) -> Iterator[dict[str, Any]]:
+    """Of every episode how far its action moves with other words, or where none was exchanged without them: means."""
+    try:
+        question = readable.question()
+        found = recorded_effects(question, attention=False)
+    except UserError:
+        return
+    if found is None:
+        return
+    rows = found.episodes()
+    exchanged = rows.filter(kind="prompt", item_kind="exchange")
+    words = exchanged if exchanged.height else rows.filter(kind="without", item_kind="word")
+    means = words.group_by("task_id", "episode_index", maintain_order=True).agg(pl.mean("effect")).drop_nulls()
+    title = f"{found.units.title}, words {'exchanged' if exchanged.height else 'left out'}"
+    yield {
+        "effects": {episode_name(task, one): _finite(size) for task, one, size in means.iter_rows()},
+        "effect": title,
+    }
 
 
 def _measured(store: Store, batch: Sequence[StoredEpisode]) -> dict[str, Any]:

@@ -362,7 +362,7 @@ def test_a_walk_by_keyboard_comes_back_to_its_card(view, server):
     assert {"BUTTON", "svg", "SELECT"} <= seen
     page.keyboard.press("Escape")
     view.settle()
-    page.wait_for_function("document.activeElement.dataset.episode === 'task000_episode001'")
+    page.wait_for_selector("[data-episode=task000_episode001]:focus")
 
 
 @pytest.mark.parametrize(

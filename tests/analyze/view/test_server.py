@@ -260,8 +260,8 @@ def test_a_store_that_goes_away_is_a_sentence(tmp_path, store):
         assert ask(running, "runs/0/task000_episode000/about.json").status == 200
         place.rename(tmp_path / "b.zarr")
         gone = ask(running, "runs/0/task000_episode001/about.json")
-        assert gone.status == 422
-        assert "task000_episode001" in json.loads(gone.body)["error"]
+        assert gone.status == 410
+        assert str(place) in json.loads(gone.body)["error"]
         assert len(json.loads(ask(running, "runs.json").body)["runs"]) == 1
 
 

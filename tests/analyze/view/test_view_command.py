@@ -7,6 +7,7 @@ import gzip
 import json
 import re
 import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -14,12 +15,13 @@ import pytest
 import vla_attention as va
 from tests.kit.planted_effects import planted_effects
 from tests.kit.stopped_programs import after_call, run_stopped
-from tests.kit.stores import StoreSpec, write_store
+from tests.kit.stores import StoreSpec, small_steps, write_store
 from tests.kit.viewer import ask, served
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.view.paths import PAGE_FILES
 from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import parse_episode_name
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, plant_effects=planted_effects())
 
@@ -39,6 +41,46 @@ def test_the_summary_has_the_numbers_of_the_analysis(store):
     for found, row in zip(document["episodes"], expected.iter_rows(named=True), strict=True):
         assert found["name"] == f"task{row['task_id']:03d}_episode{row['episode_index']:03d}"
         assert [found["ratio"], found["lift"]] == pytest.approx([row["geometric_mean"], row["ratio_lift"]])
+
+
+def test_what_needs_no_attention_is_said_first(tmp_path):
+    spec = StoreSpec(tasks=(0, 1), episodes=2, replans=2, plant_steps=small_steps, plant_effects=planted_effects())
+    opened = open_store(write_store(tmp_path / "a.zarr", spec=spec))
+    parts = list(summary_parts(opened))
+    first, *_, last = [part["findings"] for part in parts if "findings" in part]
+    assert "findings" in parts[0]
+    assert len(first) == 1
+    assert first[0] in last
+    entries = [at for at, part in enumerate(parts) if "episodes" in part]
+    assert [at for at, part in enumerate(parts) if "leaves" in part] < entries
+    (effects,) = [part["effects"] for part in parts if "effects" in part]
+    rows = va.open(opened.path).effects()["effects_episodes"].filter(kind="without", item_kind="word")
+    for name, size in effects.items():
+        task, episode = parse_episode_name(name)
+        of_episode = rows.filter(task_id=task, episode_index=episode)
+        assert size == pytest.approx(of_episode["effect"].mean())
+    assert len(effects) == 4
+
+
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="the system does not say whether a process stands still"
+)
+def test_computing_stands_still_while_somebody_waits_for_an_answer(store):
+    with served(store, summaries=True) as running:
+        summary = running.stores[0].summary
+        process = summary._process
+        assert process is not None
+
+        def state() -> str:
+            return Path(f"/proc/{process.pid}/stat").read_text().rsplit(")")[-1].split()[0]
+
+        with summary.paused(), summary.paused():
+            while state() not in "TZ":
+                time.sleep(0.001)
+        while state() == "T":
+            time.sleep(0.001)
+        assert summary.wait() is None
+        assert summary.document()["complete"]
 
 
 def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):

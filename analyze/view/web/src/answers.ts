@@ -65,6 +65,9 @@ export interface RunNumbers {
   readonly failed: string | null;
   readonly findings: readonly Finding[] | null;
   readonly leaves: Readonly<Record<string, number>> | null;
+  /** By episode how far the action moves with other words, or without them; and what that is. */
+  readonly effects: Readonly<Record<string, number | null>> | null;
+  readonly effect: string | null;
   readonly episodes: readonly { name: string; ratio: number | null; lift: number | null }[];
 }
 
@@ -213,8 +216,18 @@ const within: Record<string, string> | null = JSON.parse(document.getElementById
 let isFolder = false;
 export const NEEDS_SERVER = "This is a copy of the page: for that, open the store itself with vla-attention view.";
 
-const kept = new Map<string, Promise<unknown>>();
-const MOST_KEPT = 60;
+interface Kept {
+  readonly answer: Promise<unknown>;
+  bytes: number;
+  /** What is done when it is kept no longer. */
+  readonly forget: (() => void) | undefined;
+}
+
+/** By address what was asked for, the last used at the end, as long as all of it is below `MOST_BYTES`. */
+const kept = new Map<string, Kept>();
+export const MOST_BYTES = 64e6;
+/** Numbers in a JSON document take about so many times the memory of their digits. */
+const JSON_BYTES = 4;
 
 async function unpacked(bytes: Uint8Array<ArrayBuffer>): Promise<ArrayBuffer> {
   if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes.buffer; // a server may have unpacked it
@@ -227,54 +240,68 @@ function inside(address: string): Uint8Array<ArrayBuffer> {
   return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
-/** Whether the last question found nobody who answers. */
-export const serverGone = signal(false);
+/** What keeps the page from answering anything: the server has ended, or its store is gone; as a sentence, or empty. */
+export const trouble = signal("");
+const GONE = 410;
 
 async function answerTo(address: string): Promise<Response> {
-  try {
-    const reply = await fetch(address);
-    serverGone.value = false;
-    return reply;
-  } catch {
-    serverGone.value = true;
-    throw new Error(
-      isFolder
-        ? `Nobody answers for ${address}.`
-        : "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.",
-    );
-  }
+  const reply = await fetch(address).catch(() => null);
+  if (reply?.status === GONE) trouble.value = await saidBy(reply, address);
+  else if (reply) trouble.value = "";
+  else trouble.value = "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.";
+  if (!reply || trouble.value) throw new Error(reply || !isFolder ? trouble.value : `Nobody answers for ${address}.`);
+  return reply;
 }
+
+const saidBy = async (reply: Response, address: string): Promise<string> => {
+  const said = (await reply.json().catch(() => null)) as { error?: string } | null;
+  return said?.error ?? `The server says ${reply.status} of ${address}.`;
+};
 
 async function bytesOf(address: string): Promise<ArrayBuffer> {
   if (within) return unpacked(inside(address));
   if (isFolder && address.includes("?")) throw new Error(NEEDS_SERVER);
-  const reply = await answerTo(isFolder ? `${address}.gz` : address);
+  const reply = await answerTo(isFolder && !address.endsWith(".png") ? `${address}.gz` : address);
   if (reply.ok) return unpacked(new Uint8Array(await reply.arrayBuffer()));
-  if (isFolder) throw new Error(NEEDS_SERVER);
-  const said = (await reply.json().catch(() => null)) as { error?: string } | null;
-  throw new Error(said?.error ?? `The server says ${reply.status} of ${address}.`);
+  throw new Error(isFolder ? NEEDS_SERVER : await saidBy(reply, address));
 }
 
 /** Asks for an address once while it is kept; an answer that says what is wrong is an `Error` with its sentence. */
-function once<T>(address: string, read: (bytes: ArrayBuffer) => T): Promise<T> {
+function once<T>(address: string, read: (bytes: ArrayBuffer) => T, forget?: (value: T) => void, times = 1): Promise<T> {
   const known = kept.get(address);
-  if (known) return known as Promise<T>;
-  const answer = bytesOf(address).then(read);
-  kept.set(address, answer);
-  answer.catch(() => kept.delete(address));
-  for (const oldest of kept.keys()) {
-    if (kept.size <= MOST_KEPT) break;
-    kept.delete(oldest);
+  kept.delete(address);
+  if (known) {
+    kept.set(address, known);
+    return known.answer as Promise<T>;
   }
+  const answer = bytesOf(address).then((bytes) => {
+    own.bytes = times * bytes.byteLength;
+    forgetOldest();
+    return read(bytes);
+  });
+  const own: Kept = { answer, bytes: 0, forget: forget && (() => void answer.then(forget)) };
+  kept.set(address, own);
+  answer.catch(() => kept.delete(address));
   return answer;
 }
 
+function forgetOldest(): void {
+  let total = [...kept.values()].reduce((sum, { bytes }) => sum + bytes, 0);
+  for (const [address, one] of kept) {
+    if (total <= MOST_BYTES) return;
+    total -= one.bytes;
+    if (one.bytes) kept.delete(address); // one that is on its way stays
+    if (one.bytes) one.forget?.();
+  }
+}
+
 export function readJson<T>(address: string): Promise<T> {
-  return once(address, (bytes) => {
+  const read = (bytes: ArrayBuffer): T => {
     const document = JSON.parse(new TextDecoder().decode(bytes)) as T & { error?: string };
     if (document?.error !== undefined) throw new Error(document.error); // a copy has the sentences of errors, too
     return document;
-  });
+  };
+  return once(address, read, undefined, JSON_BYTES);
 }
 
 /** Asks anew each time. */
@@ -285,6 +312,11 @@ export function readJsonNow<T>(address: string): Promise<T> {
 
 export function readArray(address: string): Promise<NumberArray> {
   return once(address, parseNpy);
+}
+
+/** A picture as an address that is there at once. */
+export function readPicture(address: string): Promise<string> {
+  return once(address, (bytes) => URL.createObjectURL(new Blob([bytes], { type: "image/png" })), URL.revokeObjectURL);
 }
 
 /** What the page can show. Of a folder it is the one file that is not compressed, and says so. */
@@ -327,5 +359,5 @@ export const address = {
   numbers: (run: number): string => `runs/${run}/numbers.json`,
   episode: (run: number, episode: string): string => `runs/${run}/${episode}`,
   picture: (run: number, episode: string, camera: string, replan: number): string =>
-    pictureAt(`runs/${run}/${episode}/pictures/${encodeURIComponent(camera)}/${replan}.png`),
+    `runs/${run}/${episode}/pictures/${encodeURIComponent(camera)}/${replan}.png`,
 };

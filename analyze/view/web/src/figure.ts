@@ -1,5 +1,5 @@
 /** The pictures of a call as a figure of its own, drawn from what is shown and not from how a browser shows it. */
-import { address } from "./answers";
+import { address, readPicture } from "./answers";
 import { type Kind, levels, linesOf, meaning, STROKES } from "./pictures";
 import { denoise, fullNameOf, head, layer, type Side, sides, site } from "./state";
 import { outline } from "./sums";
@@ -68,7 +68,7 @@ async function drawnSide(side: Side): Promise<Drawn> {
       const cell = [PICTURE / how.columns, tall / how.rows] as const;
       const lines = linesOf({ scene, camera, how, at }).map(({ kind, inside }) => strokes(kind, outline(how, inside, cell)));
       const below = how.stored
-        ? `<image width="${PICTURE}" height="${tall}" preserveAspectRatio="none" href="${await asData(address.picture(scene.run.value, scene.name.value, camera, at))}"/>`
+        ? `<image width="${PICTURE}" height="${tall}" preserveAspectRatio="none" href="${await asData(await readPicture(address.picture(scene.run.value, scene.name.value, camera, at)))}"/>`
         : `<rect width="${PICTURE}" height="${tall}" fill="#cdcdcd"/>`;
       return `<g transform="translate(${i * (PICTURE + GAP)} ${top})">${below}${lines.join("")}${written(camera, 0, tall + LINE - 4)}</g>`;
     }),

@@ -2,7 +2,7 @@
 import { computed, effect, signal } from "@preact/signals";
 import { useEffect, useState } from "preact/hooks";
 
-import { address, type CallMaps, type HeadsOfRun, readJson } from "./answers";
+import { address, type CallMaps, type HeadsOfRun, pictureAt, readJson } from "./answers";
 import { kindOf, mark } from "./overview";
 import { Strokes } from "./pictures";
 import { axes, closeEpisode, head, layer, part, run, runNumber, setPart, site, step } from "./state";
@@ -96,7 +96,11 @@ function Thumbnail({
   const lift = how.lift[ofHead]!;
   return (
     <span class="stack">
-      {how.stored ? <img src={address.picture(runNumber.value, name, camera, replan)} alt="" loading="lazy" /> : <span class="grey" />}
+      {how.stored ? (
+        <img src={pictureAt(address.picture(runNumber.value, name, camera, replan))} alt="" loading="lazy" />
+      ) : (
+        <span class="grey" />
+      )}
       <svg viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" aria-hidden="true">
         {(["first", "second"] as const).map((kind) => (
           <Strokes key={kind} kind={kind} path={outline(how, (cell) => (lift[cell] ?? 0) >= LEVELS[kind])} />

@@ -3,11 +3,12 @@ import { computed, effect } from "@preact/signals";
 import { render } from "preact";
 
 import "./page.css";
-import { serverGone } from "./answers";
+import { trouble } from "./answers";
 import { reading } from "./effects";
 import { EpisodePage } from "./episode";
 import { HeadPage, headRead } from "./head";
 import { Overview } from "./overview";
+import { coming } from "./pictures";
 import {
   axes,
   beside,
@@ -29,9 +30,9 @@ import {
 function App() {
   return (
     <>
-      {serverGone.value ? (
+      {trouble.value ? (
         <p class="banner" role="alert">
-          Nobody answers: vla-attention view has ended. Start it again, and load this page anew.
+          {trouble}
         </p>
       ) : null}
       {mended.value ? (
@@ -92,19 +93,28 @@ effect(() => {
   const shown = line ? `task ${line.task}, episode ${line.episode} · ${run.value!.name}` : ofHead;
   document.title = shown ? `${shown} · Attention` : "Attention";
 });
-// Who walks by keyboard goes on at the beginning of an episode, and behind it at the card that it was opened from.
-let last = episodeName.peek();
+// Who walks by keyboard goes on at the beginning of an episode, and behind it at the card that it was opened from; the list is
+// where it was.
+const shownNow = computed(() => episodeName.value || part("of"));
+let [last, scrolled] = [shownNow.peek(), 0];
 effect(() => {
-  const [now, before] = [episodeName.value, last];
+  const [now, before] = [shownNow.value, last];
   last = now;
-  if (now !== before)
-    requestAnimationFrame(() =>
-      (now ? page : (document.querySelector<HTMLElement>(`[data-episode="${CSS.escape(before)}"]`) ?? page)).focus(),
-    );
+  if (now === before) return;
+  if (!before) scrolled = scrollY;
+  const top = now ? 0 : scrolled;
+  requestAnimationFrame(() => {
+    const card = now ? null : document.querySelector<HTMLElement>(`[data-episode="${CSS.escape(before)}"]`);
+    (card ?? page).focus({ preventScroll: true });
+    scrollTo(0, top);
+  });
 });
+
 // For who waits until all is drawn: taken back at once, given when the browser has drawn.
 const ready = computed(
-  () => !runs.value.pending && (episodeName.value === "" ? headRead.value : main.ready.value && beside.ready.value && !reading.value),
+  () =>
+    !runs.value.pending &&
+    (episodeName.value === "" ? headRead.value : main.ready.value && beside.ready.value && !reading.value && coming.value === 0),
 );
 const mark = (): void => {
   page.dataset.ready = ready.peek() ? "1" : "";

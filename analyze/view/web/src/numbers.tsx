@@ -18,6 +18,7 @@ import {
   runs,
   type Side,
   sides,
+  site,
   step,
   words,
   wordsOf,
@@ -39,8 +40,18 @@ export function Ratio() {
       lift: at(of.lift),
     }))
     .filter(({ keys }) => (keys ?? 0) > 0);
+  const missing = [
+    ["visual", "picture"],
+    ["linguistic", "text"],
+  ].flatMap(([name, said]) => (parts.some((one) => one.name === name) ? [] : [said!]));
   return (
     <section class="ratio" aria-label="Attention in this call">
+      {numbers.sides ? null : (
+        <p class="soft">
+          No ratio at site {site.value}:{" "}
+          {missing.length ? `there is no ${missing.join(" and no ")} among its tokens.` : "pictures and text are not both read here."}
+        </p>
+      )}
       {numbers.sides ? (
         <p>
           {nameOf(sides.value[0]!) ? `${nameOf(sides.value[0]!)}: ` : ""}

@@ -1,7 +1,7 @@
 /** The first page: what the run shows, and its episodes as pictures, task by task. */
 import { computed, signal } from "@preact/signals";
 
-import { address, type EpisodeLine } from "./answers";
+import { address, type EpisodeLine, pictureAt } from "./answers";
 import { openEpisode, part, run, runNumber, runNumbers, runs, setPart } from "./state";
 import { shown } from "./sums";
 
@@ -56,14 +56,16 @@ const orders: Record<string, { name: string; of: (line: EpisodeLine) => number |
   shortest: { name: "fewest steps first", of: ({ num_steps }) => num_steps || null },
   longest: { name: "most steps first", of: ({ num_steps }) => (num_steps ? -num_steps : null) },
   lowest: { name: "lowest ratio first", of: ({ name }) => numbersOf.value.get(name)?.ratio },
-  highest: {
-    name: "highest ratio first",
-    of: ({ name }) => {
-      const ratio = numbersOf.value.get(name)?.ratio;
-      return ratio == null ? null : -ratio;
-    },
-  },
+  highest: { name: "highest ratio first", of: ({ name }) => minus(numbersOf.value.get(name)?.ratio) },
+  moved: { name: "words move most first", of: ({ name }) => minus(runNumbers.value?.effects?.[name]) },
+  unmoved: { name: "words move least first", of: ({ name }) => runNumbers.value?.effects?.[name] },
 };
+const minus = (one: number | null | undefined): number | null => (one == null ? null : -one);
+const byEffect = computed(() => ["moved", "unmoved"].includes(part("sort")));
+/** Those that the run has numbers for. */
+const usedOrders = computed(() =>
+  Object.entries(orders).filter(([name]) => !["moved", "unmoved"].includes(name) || runNumbers.value?.effects || part("sort") === name),
+);
 const numbersOf = computed(() => new Map((runNumbers.value?.episodes ?? []).map((one) => [one.name, one])));
 /** What a link names, or what stands first where there is nothing of that name. */
 const chosen = <T,>(all: Record<string, T>, name: string): T => (Object.keys(all).includes(name) ? all[name]! : Object.values(all)[0]!);
@@ -101,7 +103,7 @@ export function kindOf(line: EpisodeLine): "solved" | "failed" | "unknown" {
 export const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·");
 
 function Card({ line }: { line: EpisodeLine }) {
-  const numbers = numbersOf.value.get(line.name);
+  const [numbers, effect] = [numbersOf.value.get(line.name), runNumbers.value?.effects?.[line.name]];
   return (
     <button
       class={`card ${kindOf(line)}`}
@@ -110,7 +112,7 @@ function Card({ line }: { line: EpisodeLine }) {
       onClick={() => openEpisode(line.name)}
     >
       {line.picture ? (
-        <img src={address.picture(runNumber.value, line.name, ...line.picture)} alt="" loading="lazy" />
+        <img src={pictureAt(address.picture(runNumber.value, line.name, ...line.picture))} alt="" loading="lazy" />
       ) : (
         <span class="no-picture">{line.failed === undefined ? "no pictures" : "cannot be read"}</span>
       )}
@@ -120,8 +122,12 @@ function Card({ line }: { line: EpisodeLine }) {
           {line.scene == null ? line.episode : `scene ${line.scene}`}
         </b>
         {line.num_steps ? <span>{line.num_steps} steps</span> : null}
-        {numbers?.ratio != null ? (
-          <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>
+        {byEffect.value && effect != null ? (
+          <span class="soft ratio-of" title={runNumbers.value?.effect ?? ""}>
+            words: {shown(effect)}
+          </span>
+        ) : numbers?.ratio != null ? (
+          <span class="soft ratio-of" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>
             ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)
           </span>
         ) : null}
@@ -154,7 +160,7 @@ function Matrix() {
           {[...told].map(([task, instruction]) => (
             <tr key={task}>
               <th scope="row">
-                {instruction} <span class="soft">{task}</span>
+                <bdi>{instruction}</bdi> <span class="soft">{task}</span>
               </th>
               {scenes.map((scene) => (
                 <td key={scene} class={scene === task ? "own" : ""}>
@@ -199,6 +205,7 @@ function Findings() {
             {all.value ? "fewer" : `${numbers.findings.length - FIRST_FINDINGS} more`}
           </button>
         ) : null}
+        {numbers.complete ? null : <span class="soft"> More is being computed …</span>}
       </section>
     );
   }
@@ -266,7 +273,7 @@ export function Overview() {
           value={chosen(orders, part("sort")) === orders.task ? "task" : part("sort")}
           onChange={(event) => setPart({ sort: event.currentTarget.value })}
         >
-          {Object.entries(orders).map(([name, { name: text }]) => (
+          {usedOrders.value.map(([name, { name: text }]) => (
             <option value={name}>{text}</option>
           ))}
         </select>
@@ -277,6 +284,7 @@ export function Overview() {
           value={part("find")}
           onInput={(event) => setPart({ find: event.currentTarget.value })}
         />
+        {byEffect.value && runNumbers.value?.effect ? <span class="soft">{runNumbers.value.effect}</span> : null}
         <span class="soft" role="status">
           {listed.value.length} of {shownRun.episodes.length} episodes
         </span>
@@ -287,7 +295,7 @@ export function Overview() {
           <section class="task" key={`${task} ${instruction}`}>
             {task ? (
               <h2>
-                <span class="soft">task {task}</span> {instruction}
+                <span class="soft">task {task}</span> <bdi>{instruction}</bdi>
               </h2>
             ) : null}
             <div class="cards">

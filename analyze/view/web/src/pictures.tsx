@@ -1,7 +1,9 @@
 /** The pictures of a replan. Attention is lines around patches: the picture itself stays as it was. */
 import { computed, signal } from "@preact/signals";
 
-import { address, type CameraLayout } from "./answers";
+import { useLayoutEffect, useState } from "preact/hooks";
+
+import { address, type CameraLayout, readPicture } from "./answers";
 import { Hint } from "./hint";
 import {
   about,
@@ -144,9 +146,36 @@ function aboutCell({ scene, camera, how, at }: At, cell: number): string {
   return `${where}: ${percent(sums[cell])} of all attention, ${percent(sums[cell]! / ofPicture)} of this picture's, ${shown(cellLifts(mass, even, how)[cell])} times even${things.length ? `, ${things.join(", ")}` : ""}`;
 }
 
+/** Pictures that were asked for and are not there. */
+export const coming = signal(0);
+
+/** The call whose picture is there, and the picture: lines change with it. The one of the next call is asked for, too. */
+function usePicture({ scene, camera, how, at }: At): { readonly at: number; readonly url: string } {
+  const wanted = (replan: number): string => address.picture(scene.run.value, scene.name.value, camera, replan);
+  const [shown, setShown] = useState({ at, url: "", of: "" });
+  const [of, last] = [`${scene.run.value} ${scene.name.value}`, (scene.about.value.value?.starts.length ?? 1) - 1];
+  useLayoutEffect(() => {
+    if (!how.stored) return;
+    let live = true;
+    const show = (url: string): void => {
+      if (live) setShown({ at, url, of });
+    };
+    coming.value++;
+    const read = readPicture(wanted(at)).then(show, () => show("")); // what is wrong is said where it is read
+    void read.finally(() => coming.value--);
+    if (at < last) readPicture(wanted(at + 1)).catch(() => undefined);
+    return () => {
+      live = false;
+    };
+  }, [at, of, how.stored]);
+  return how.stored && shown.of === of ? shown : { at, url: "" };
+}
+
 /** One camera at a replan. Clicks pick patches, in both episodes the same ones. */
-function Picture(one: At) {
-  const { scene, camera, how, at } = one;
+function Picture(given: At) {
+  const { scene, camera, how } = given;
+  const { at, url } = usePicture(given);
+  const one = { ...given, at };
   const here = pointed.value?.camera === camera && pointed.value.scene === scene ? pointed.value.cell : null;
   const toggle = (cell: number): void => {
     if (hasCells(scene, camera))
@@ -165,12 +194,7 @@ function Picture(one: At) {
     <figure class="picture">
       <div class="stack" data-camera={camera}>
         {how.stored ? (
-          <img
-            src={address.picture(scene.run.value, scene.name.value, camera, at)}
-            alt={`${camera} at call ${at}`}
-            width={how.width}
-            height={how.height}
-          />
+          <img src={url || undefined} alt={`${camera} at call ${at}`} width={how.width} height={how.height} />
         ) : (
           <div class="grey" />
         )}

@@ -1,9 +1,10 @@
 /** The instruction as a title: its words shaded by what they do or by attention, and what is known of the picked ones. */
 import { computed } from "@preact/signals";
 
+import type { SiteLayout } from "./answers";
 import { EffectsOfWords, effects, exchangesKnown, noise, ofWord, said, shade, strength } from "./effects";
 import { Hint } from "./hint";
-import { about, groupOf, massesAt, picked, replan, setPart, step, toggled, uniformAt, words } from "./state";
+import { about, groupOf, layout, massesAt, picked, replan, setPart, site, step, toggled, uniformAt, words } from "./state";
 import { percent, shown, sumOf } from "./sums";
 
 const once = (keys: readonly number[]): [number, number][] => keys.map((key) => [key, 1]);
@@ -52,24 +53,51 @@ function toggle(place: number): void {
   step({ group: groupOf({ words: chosen }), without: last === undefined ? "" : ofWord(words.value[last]!.text).label });
 }
 
+/** A sentence in pieces: its words with their places, and what stands between them (signs, emoji). Where it does not hold all
+ * of the words in their order, the words alone. */
+export function piecesOf(sentence: string, texts: readonly string[]): readonly { text: string; place: number | null }[] {
+  const pieces: { text: string; place: number | null }[] = [];
+  let at = 0;
+  for (const [place, text] of texts.entries()) {
+    const begin = at + sentence.slice(at).search(new RegExp(text.replace(/[\\^$.*+?()[\]{}|/]/g, "\\$&"), "iu"));
+    if (begin < at) return texts.map((word, i) => ({ text: word, place: i }));
+    if (sentence.slice(at, begin).trim()) pieces.push({ text: sentence.slice(at, begin).trim(), place: null });
+    pieces.push({ text: sentence.slice(begin, begin + text.length), place });
+    at = begin + text.length;
+  }
+  if (sentence.slice(at).trim()) pieces.push({ text: sentence.slice(at).trim(), place: null });
+  return pieces;
+}
+
+/** The site that has words, where the shown one has none. */
+const spelled = computed(() => {
+  const sites = Object.entries(about.value.value?.sites ?? {});
+  const has = ({ prompts }: SiteLayout): boolean => prompts.some(({ words: some }) => some.length > 0);
+  return layout.value && !has(layout.value) ? (sites.find(([, of]) => has(of))?.[0] ?? "") : null;
+});
+
 export function Title() {
   const episode = about.value.value;
   if (!episode) return null;
   const chosen = picked.value.words;
   return (
     <div class="title">
-      <h1>
+      <h1 dir="auto">
         {words.value.length
-          ? words.value.map(({ text }, i) => {
-              const { colour, line, none, title } = shades.value[i]!;
+          ? piecesOf(
+              episode.told,
+              words.value.map(({ text }) => text),
+            ).map(({ text, place }, at) => {
+              if (place === null) return <span key={`${at}`}>{text} </span>;
+              const { colour, line, none, title } = shades.value[place]!;
               return (
                 <button
-                  key={i}
+                  key={`${at}`}
                   class={`word${none ? " none" : ""}`}
-                  aria-pressed={chosen.includes(i)}
+                  aria-pressed={chosen.includes(place)}
                   title={title}
                   style={{ "--strength": colour.toFixed(3), "--line": line.toFixed(3) }}
-                  onClick={() => toggle(i)}
+                  onClick={() => toggle(place)}
                 >
                   {text}
                 </button>
@@ -77,6 +105,12 @@ export function Title() {
             })
           : episode.told}
       </h1>
+      {spelled.value === null ? null : (
+        <span class="soft">
+          site {site.value} reads no words{" "}
+          {spelled.value ? <button onClick={() => setPart({ site: spelled.value!, group: "" })}>show site {spelled.value}</button> : null}
+        </span>
+      )}
       {shades.value.length && shades.value.every(({ none }) => none) ? (
         <span class="soft">no word moves the action more than another noise seed does</span>
       ) : null}
@@ -134,7 +168,9 @@ export function AboutWords() {
             const { text, keys } = words.value[i]!;
             return (
               <tr key={i}>
-                <th>{text}</th>
+                <th>
+                  <bdi>{text}</bdi>
+                </th>
                 <td>{percent(mass && sumOf(mass, once(keys)))}</td>
                 <td>{shown(liftOf(keys, replan.value))} times even</td>
               </tr>
