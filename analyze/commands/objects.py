@@ -110,8 +110,6 @@ def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> R
             Table("pointing_episodes", pointing),
             Table("iou_episodes", overlaps),
         ]
-        bars = regions.filter(shown & ~_IS_WHOLE_CLASS)
-        figures.append(Figure("objects_iou", "forest", bars, *_IOU_SAYS, _IOU_BARS))
     tables += [Table("objects_episodes", episodes), *([] if by else [Table("object_times", object_times(measured))])]
     left_out = given - len(question.selected)
     none = [f"No object is marked in the pictures of {plural(left_out, 'more episode')}."] if left_out else []
@@ -190,12 +188,3 @@ _BARS = {
     "log": True,
     "xlabel": "attention / area (logarithmic)",
 }
-_IOU_SAYS = (
-    "How well the attended region is the object",
-    "Points: IoU of the object's patches with the tenth of the patches that get the most attention, mean over layers "
-    "and episodes; bars: 95% intervals. Dashed: the same with the map moved about the picture.",
-)
-_IOU_BARS = {
-    "value": "iou", "label": "item", "color": "camera", "uniform": "iou_chance", "baseline_name": "by chance",
-    "xlabel": "IoU",
-}  # fmt: skip
