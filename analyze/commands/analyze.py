@@ -104,7 +104,7 @@ def analyze(
             Table("replans_groups", levels.groups("replan", "layer"), file=False),
             *sinks,
         ],
-        _figures(levels, tasks, groups, episodes, shown),
+        _figures(levels, tasks, groups, episodes),
         [*notes(part), *_notes(levels, cell)],
         files,
     )
@@ -213,20 +213,21 @@ def _notes(levels: Levels, cell: _Row) -> list[str]:
     return said
 
 
-def _figures(
-    levels: Levels, tasks: pl.DataFrame, groups: pl.DataFrame, episodes: pl.DataFrame, shown: Collection[str]
-) -> list[Figure]:
+def _figures(levels: Levels, tasks: pl.DataFrame, groups: pl.DataFrame, episodes: pl.DataFrame) -> list[Figure]:
     """Fractions by layer; with a ratio also tasks, the layers' profile, and how episodes are spread."""
-    of_layers = overall(groups).filter(pl.col("group").is_in([*shown]))
-    of_layers = of_layers.with_columns(pl.col("layer").replace(LAYERS_AVG, "all"))
-    n = f"Means over {plural(len(levels.question.selected), 'episode')}, every task weighing the same."
-    stacked = {"x": "layer", "value": "fraction", "color": "group", "ylabel": "part of the attention"}
-    found = [Figure("attention_fractions", "stacked", of_layers, "How attention is divided, by layer", n, stacked)]
+    num_episodes = len(levels.question.selected)
+    n = f"Means over {plural(num_episodes, 'episode')}, every task weighing the same."
+    stacked = {"x": "layer", "value": "fraction", "color": "group", "ylabel": "part of the attention",
+               "mean": LAYERS_AVG, "num_episodes": num_episodes}  # fmt: skip
+    title, all_of_them = "How attention is divided, by layer", f"{n} Beside the names: all layers, with 95% intervals."
+    found = [Figure("attention_fractions", "stacked", overall(groups), title, all_of_them, stacked)]
     if levels.grouping.ratio is None:
         return found
     name = " / ".join("+".join(side) for side in sides(levels.grouping))
     look = {"log": True, "uniform": "uniform_ratio", "value": "geometric_mean", "baseline_name": "if spread evenly"}
-    label = pl.coalesce(pl.format("{}: {}", "task_id", "instruction"), "suite", pl.lit("all suites")).alias("task")
+    label = pl.coalesce(
+        pl.format("{}: {}", "task_id", "instruction"), pl.format("{}, all tasks", "suite"), pl.lit("all suites")
+    ).alias("task")
     of_tasks = tasks.filter(AVERAGE).with_columns(label)
     dots = episodes.filter(AVERAGE).with_columns(label)
     title, bars = f"Ratio {name} of every task", f"{n} Bars: 95% intervals; small dots: episodes."

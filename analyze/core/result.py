@@ -15,7 +15,7 @@ import polars as pl
 Kind: TypeAlias = Literal["text", "prose", "count", "number", "percent", "factor", "signed", "points", "p"]
 #: The kinds of `analyze.render.figures`.
 FigureKind: TypeAlias = Literal[
-    "forest", "lines", "heat_map", "stacked", "distribution", "scatter", "pictures", "evolution"
+    "forest", "lines", "courses", "heat_map", "stacked", "distribution", "scatter", "pictures"
 ]
 
 

@@ -123,6 +123,7 @@ def _figures_of_file(table: ResultsTables, end: str) -> dict[str, Figure]:
 
     from vla_attention.analyze.core.levels import overall
     from vla_attention.analyze.core.result import Figure
+    from vla_attention.analyze.measures.tables import LAYERS_AVG
 
     note = _NO_KEYS if table.replans["uniform_ratio"].is_null().all() else ""
     label = pl.coalesce(pl.format("{}: {}", "task_id", "instruction"), "suite", pl.lit("all")).alias("task")
@@ -144,7 +145,8 @@ def _figures_of_file(table: ResultsTables, end: str) -> dict[str, Figure]:
         "fractions": Figure(
             f"attention_fractions{end}", "stacked", overall(table.groups), "How attention is divided, by layer",
             f"Masses: {table.grouping.description}.",
-            {"x": "layer", "value": "fraction", "color": "group", "ylabel": "part of the attention"},
+            {"x": "layer", "value": "fraction", "color": "group", "ylabel": "part of the attention",
+             "mean": LAYERS_AVG, "num_episodes": dots.height},
         ),
     }  # fmt: skip
 

@@ -6,10 +6,14 @@ The options of a figure, by kind:
                   (category -> text). baseline: the line of no effect, or `uniform`, a column with one for each row;
                   baseline_name. dots: a frame of label and value, single episodes. log: a logarithmic axis. xlabel.
     lines         x, value; color: a column of series. uniform: a column, drawn dashed. log, xlabel, ylabel.
-    stacked       x, value, color: a column of parts, which are stacked in their order. ylabel, xlabel.
+    courses       x from 0 to 1, value, label: a column of series, each in a strip of its own, on a logarithmic axis.
+                  reference: the series that all strips show. color, colors, names: as of a forest. xlabel, ylabel.
+    stacked       x, value, color: a column of parts, which are stacked in their order. mean: the x of all others
+                  together, drawn apart, whose values the legend says. num_episodes. ylabel, xlabel.
     distribution  x, value: a box for each x, with a dot for each row. uniform, log, xlabel, ylabel.
     heat_map      x, y, value: factors around 1, or shares with share=True. xlabel, ylabel, label.
-    scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log (both axes), xlabel, ylabel.
+    scatter       x, y, label: points with names, y_low and y_high as bars; both axes are logarithmic. color, colors,
+                  names, baseline (of y), baseline_name: as of a forest. x_baseline, xlabel, ylabel.
     pictures      see `render.pictures`.
 
 NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame has it, is said.
@@ -17,7 +21,7 @@ NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -25,9 +29,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.core.result import Column, Figure
 from vla_attention.analyze.render.files import replacing
+from vla_attention.analyze.render.numbers import cell
 from vla_attention.analyze.render.pictures import pictures
+from vla_attention.analyze.render.point_names import name_points
 from vla_attention.analyze.render.style import (
     BASELINE_COLOR,
     DOT_COLOR,
@@ -36,7 +42,9 @@ from vla_attention.analyze.render.style import (
     Style,
     explain,
     group_styles,
+    is_narrow,
     label_positions,
+    letters,
     ratio_axis,
     scattered,
     share_ticks,
@@ -57,6 +65,12 @@ _MOST_ROWS = 60
 _MOST_DOTS = 300
 #: More labels than this along an axis would touch.
 _MOST_LABELS = 24
+#: A forest with more rows than this has low ones; so many points need high axes.
+_MOST_HIGH_ROWS, _MANY_POINTS = 30, 16
+#: Of a row's height, the interval stands so far above its middle where episodes are below it.
+_ABOVE_DOTS = 0.16
+#: Of the room for a series, its strip; of the width of a bar, the gap before the one of all others together.
+_STRIP, _APART = 0.84, 0.7
 #: What the line of attention without a preference is called, in every picture.
 BASELINE_NAME = "if spread evenly"
 
@@ -105,21 +119,29 @@ def _plot(figure: Figure, style: Style) -> Canvas:
     if figure.kind not in ("lines", "heat_map"):  # these show where a value is missing
         measured = [o["value"]] if "value" in o else [o["x"], o["y"]]
         values = [pl.col(name).cast(pl.Float64) for name in measured]
-        rows = rows.filter(value.is_finite() & ((value > 0) | (not o.get("log"))) for value in values)
+        positive = o.get("log") or figure.kind in ("courses", "scatter")
+        rows = rows.filter(value.is_finite() & ((value > 0) | (not positive)) for value in values)
     rows = rows.head(_MOST_ROWS) if figure.kind == "forest" else rows
-    kind, height = _KINDS[figure.kind]
     canvas = style.canvas(style.width(wide=False), 1)
-    axes = canvas.add_subplot()
+    axes, height = canvas.add_subplot(), 1.0
     if rows.is_empty() or (figure.kind == "lines" and not rows[o["value"]].cast(pl.Float64).is_finite().any()):
         explain(axes, "No value is finite and positive: there is nothing to draw.")
     else:
-        kind(axes, rows, o)
+        height = _KINDS[figure.kind](axes, rows, o)
         xlabel = o.get("xlabel", o["value"] if figure.kind == "forest" else o["x"])
-        axes.set_xlabel(wrapped(xlabel, int(10 * canvas.get_figwidth()), 2))
+        axes.set_xlabel(wrapped(xlabel, int((8 if figure.kind == "forest" else 10) * canvas.get_figwidth()), 2))
         axes.set_ylabel(o.get("ylabel", "" if figure.kind == "forest" else o.get("y") or o["value"]))
-        if figure.kind in ("forest", "lines") and "num_episodes" in rows.columns:
-            _say_counts(axes, rows, style)
-    _framed(canvas, figure, height(rows, o), style)
+        if figure.kind in ("forest", "lines", "scatter") and "num_episodes" in rows.columns:
+            _say_counts(axes, rows["num_episodes"].to_list(), style)
+        elif "num_episodes" in o:
+            _say_counts(axes, [o["num_episodes"]], style)
+        if figure.kind == "stacked":
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), reverse=True, borderaxespad=0, handlelength=1.4,
+                        labelspacing=0.4, alignment="left", title="all [95% interval]" if "mean" in o else None,
+                        title_fontsize=7)  # fmt: skip
+    _framed(canvas, figure, height, style)
+    if figure.kind == "scatter" and rows.height:
+        name_points(axes, rows[o["label"]].to_list(), rows[o["x"]].to_numpy(), *_bounds(rows, o["y"]))
     return canvas
 
 
@@ -128,16 +150,17 @@ def _framed(canvas: Canvas, figure: Figure, height: float, style: Style) -> None
 
     A paper has no title: its caption file has it. Sizes are counted in letters; only the axes' own texts are measured.
     """
-    handles, labels = canvas.axes[0].get_legend_handles_labels()
+    handles, labels = canvas.axes[0].get_legend_handles_labels() if canvas.axes[0].get_legend() is None else ([], [])
     width, letter = canvas.get_figwidth(), 0.062 if style.paper else 0.07
     lengths = [0.42 + letter * len(label) for label in labels]
     columns = len(labels) if sum(lengths) < width - 0.1 else max(1, int((width - 0.1) / max(lengths)))
-    title = 0.05 if style.paper else 0.28
+    said = wrapped(figure.title, int(13 * width), 2)
+    title = 0.05 if style.paper else 0.28 + 0.16 * said.count("\n")
     top = title + (0.17 * -(-len(labels) // columns) if labels else 0)
     whole = top + height * (0.72 if style.paper else 1)
     canvas.set_figheight(whole)
     if not style.paper:
-        canvas.text(0.08 / width, 1 - 0.07 / whole, wrapped(figure.title, int(13 * width), 1), va="top", size=10)
+        canvas.text(0.08 / width, 1 - 0.07 / whole, said, va="top", size=10)
     if handles:
         canvas.legend(handles, labels, loc="upper left", bbox_to_anchor=(0.03 / width, 1 - title / whole),
                       ncols=columns, borderaxespad=0, handlelength=1.4, columnspacing=1.0, borderpad=0.1)  # fmt: skip
@@ -150,29 +173,34 @@ def _framed(canvas: Canvas, figure: Figure, height: float, style: Style) -> None
     axes.set_position((left, bottom, 1 - left - right, 1 - bottom - over - top / whole))
 
 
-def _forest(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+def _forest(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     value, low, high = _bounds(rows, o["value"])
     uniform = rows[o["uniform"]].cast(pl.Float64).to_numpy() if "uniform" in o else np.array([])
     baseline, dots, name = o.get("baseline"), o.get("dots"), o.get("baseline_name")
     places, colors = np.arange(rows.height), _colors_of(axes, rows, o)
+    at = places.astype(np.float64)
     if dots is not None:
-        _dots(axes, rows, dots, o)
+        at -= _ABOVE_DOTS * _dots(axes, rows, dots, o)
     if o.get("log"):
         single = dots[o["value"]].drop_nulls().to_numpy() if dots is not None else np.array([])
         fixed = [baseline] if baseline is not None else []
         ratio_axis(axes.xaxis, np.concatenate([value, low[low > 0], high[np.isfinite(high)], uniform, single, fixed]))
     left, right = axes.get_xlim() if o.get("log") else (-np.inf, np.inf)
-    axes.hlines(places, np.clip(low, left, right), np.clip(high, left, right), color=colors, linewidth=2)
-    axes.scatter(value, places, c=colors, s=20, zorder=3)
+    axes.hlines(at, np.clip(low, left, right), np.clip(high, left, right), color=colors, linewidth=2)
+    axes.scatter(value, at, c=colors, s=20, zorder=3)
     line: Any = {"color": BASELINE_COLOR, "linestyle": "--", "linewidth": 1, "label": name}
     if baseline is not None:
         axes.axvline(baseline, **line)
     if uniform.size:
         axes.vlines(uniform, places - 0.4, places + 0.4, **line)
-    axes.set_yticks(places, [shortened(str(label), 44) for label in rows[o["label"]]])
+    few = rows.height <= _MOST_HIGH_ROWS
+    names = [wrapped(str(label), letters(axes, 0.45), 1 + few) for label in rows[o["label"]]]
+    axes.set_yticks(places, names, linespacing=1.0)
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(rows.height - 0.4, -0.6)
     axes.grid(axis="x")
+    row = 0.34 if any("\n" in one for one in names) else 0.28 if few and dots is not None else 0.21 if few else 0.17
+    return (0.85 if is_narrow(axes) else 0.55) + row * max(rows.height, 2)
 
 
 def _bounds(rows: pl.DataFrame, name: str) -> tuple[NDArray[np.float64], ...]:
@@ -184,13 +212,15 @@ def _bounds(rows: pl.DataFrame, name: str) -> tuple[NDArray[np.float64], ...]:
     return tuple(rows.select(one.cast(pl.Float64)).to_series().to_numpy() for one in (pl.col(name), *ends))
 
 
-def _dots(axes: Axes, rows: pl.DataFrame, dots: pl.DataFrame, o: Options) -> None:
-    """Single episodes, around the middle of their row."""
-    generator = np.random.default_rng(0)
+def _dots(axes: Axes, rows: pl.DataFrame, dots: pl.DataFrame, o: Options) -> NDArray[np.bool_]:
+    """Single episodes, below the interval of their row, which hides none; returns which rows have some."""
+    generator, having = np.random.default_rng(0), np.zeros(rows.height, dtype=bool)
     for place, label in enumerate(rows[o["label"]]):
         of_row = dots.filter(pl.col(o["label"]) == label)[o["value"]].drop_nulls().to_numpy()
-        axes.scatter(of_row, scattered(generator, place, len(of_row)), s=9, color=DOT_COLOR, linewidths=0, zorder=2,
-                     label="one episode" if place == 0 else None)  # fmt: skip
+        having[place] = len(of_row)
+        axes.scatter(of_row, scattered(generator, place + 0.26, len(of_row), 0.12), s=9, color=DOT_COLOR, alpha=0.8,
+                     linewidths=0, zorder=2, label=None if place else "one episode")  # fmt: skip
+    return having
 
 
 def _colors_of(axes: Axes, rows: pl.DataFrame, o: Options) -> list[str]:
@@ -206,19 +236,20 @@ def _colors_of(axes: Axes, rows: pl.DataFrame, o: Options) -> list[str]:
     return [of[kind] for kind in rows[o["color"]]]
 
 
-def _say_counts(axes: Axes, rows: pl.DataFrame, style: Style) -> None:
+def _say_counts(axes: Axes, counts: Sequence[int | None], style: Style) -> None:
     """How many episodes: once where all rows have as many (in a paper the caption says it), else beside each row."""
-    counts = rows["num_episodes"].to_list()
+    known = [count for count in counts if count is not None]
     small: Any = {"color": NOTE_COLOR, "size": 7}
-    if len(set(counts)) == 1:
-        if not style.paper:
-            axes.text(1.0, 1.01, f"n = {counts[0]} episodes", transform=axes.transAxes, ha="right", **small)
-    elif axes.yaxis_inverted():  # a forest
-        for place, text in zip((-0.75, *range(len(counts))), ("n", *map(str, counts)), strict=True):
-            axes.text(1.01, place, text, transform=axes.get_yaxis_transform(), va="center", **small)
+    if known and axes.yaxis_inverted() and len(set(counts)) > 1:  # a forest
+        for place, count in enumerate(counts):
+            axes.text(1.01, place, str(count), transform=axes.get_yaxis_transform(), va="center", **small)
+        axes.text(1.01, 1.0, "n", transform=axes.transAxes, **small)
+    elif known and not (style.paper and len(set(known)) == 1):
+        n = f"{min(known)} to {max(known)}" if len(set(known)) > 1 else known[0]
+        axes.text(1.0, 1.01, f"n = {n} episodes", transform=axes.transAxes, ha="right", **small)
 
 
-def lines(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+def lines(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     """Lines over a numerical axis, broken where a value does not exist."""
     names = rows[o["color"]].unique(maintain_order=True).to_list() if "color" in o else [None]
     styles = group_styles([str(name) for name in names]) if "color" in o else {"None": {"color": SERIES_COLORS[0]}}
@@ -236,42 +267,86 @@ def lines(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
         axes.plot(part[o["x"]], part[o["uniform"]], "--", color=BASELINE_COLOR, linewidth=1, label=BASELINE_NAME)
     if o.get("log"):
         uniform = rows[o["uniform"]].drop_nulls().to_list() if "uniform" in o else []
-        value, low, high = _bounds(rows, o["value"])
-        finite = value[np.isfinite(value) & (value > 0)]
-        # A band that runs far beyond all values is cut at the frame, where a triangle says so.
-        ends = np.clip([low, high], finite.min() / 3, finite.max() * 3).ravel()
-        ratio_axis(axes.yaxis, np.concatenate([finite, ends, uniform]))
-        bottom, top = axes.get_ylim()
-        for mark, cut, at in (("v", low < bottom, 0.015), ("^", high > top, 0.985)):
-            places = rows[o["x"]].to_numpy()[cut]
-            axes.plot(places, np.full(len(places), at), mark, color=NOTE_COLOR, markersize=4, clip_on=False,
-                      transform=axes.get_xaxis_transform())  # fmt: skip
-        if (low < bottom).any() or (high > top).any():
-            axes.plot([], [], "^", color=NOTE_COLOR, markersize=4, label="the interval goes on")
+        _log_axis(axes, rows[o["x"]].to_numpy(), _bounds(rows, o["value"]), uniform)
     else:
         axes.set_ylim(bottom=0)
     if rows[o["x"]].dtype.is_integer():
         whole_numbers(axes.xaxis)
     axes.grid(axis="y")
+    return 3.0
 
 
-def stacked(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+def _log_axis(axes: Axes, x: NDArray[Any], bounds: Sequence[NDArray[np.float64]], more: Iterable[float]) -> None:
+    """A logarithmic y axis around values; an interval far beyond them is cut at the frame, where a triangle says so."""
+    value, low, high = bounds
+    finite = value[np.isfinite(value) & (value > 0)]
+    ends = np.clip([low, high], finite.min() / 3, finite.max() * 3).ravel()
+    ratio_axis(axes.yaxis, np.concatenate([finite, ends, [*more]]))
+    bottom, top = axes.get_ylim()
+    for mark, cut, at in (("v", low < bottom, 0.015), ("^", high > top, 0.985)):
+        axes.plot(x[cut], np.full(cut.sum(), at), mark, color=NOTE_COLOR, markersize=4, markeredgewidth=0, alpha=0.8,
+                  clip_on=False, transform=axes.get_xaxis_transform())  # fmt: skip
+    if (low < bottom).any() or (high > top).any():
+        axes.plot([], [], "^", color=NOTE_COLOR, markersize=4, label="the interval goes on")
+
+
+def _courses(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
+    """Bands of different series share no place, so that none hides another."""
+    is_reference = rows[o["label"]] == o.get("reference", "")
+    reference, rows = rows.filter(is_reference), rows.filter(~is_reference)
+    series, colors = rows[o["label"]].to_numpy(), np.array(_colors_of(axes, rows, o))
+    names: list[str] = list(dict.fromkeys(series))
+    x = np.array([names.index(name) for name in series]) + _STRIP * (rows[o["x"]].to_numpy() - 0.5)
+    bounds, (middle, least, most) = _bounds(rows, o["value"]), _bounds(reference, o["value"])
+    _log_axis(axes, x, bounds, [*middle, *np.clip([least, most], middle / 3, middle * 3).ravel()])
+    for place, name in enumerate(names):
+        at = place + _STRIP * (reference[o["x"]].to_numpy() - 0.5)
+        axes.plot(at, middle, "--", color=BASELINE_COLOR, linewidth=1,
+                  label=o["reference"] if reference.height and not place else None)  # fmt: skip
+        axes.fill_between(at, least, most, facecolor="none", edgecolor="#CCCCCC", hatch="//////", linewidth=0, zorder=0)
+        here = series == name
+        value, low, high = (ends[here] for ends in bounds)
+        axes.fill_between(x[here], low, high, color=colors[here][0], alpha=0.25, linewidth=0)
+        axes.plot(x[here], value, "o-", color=colors[here][0], markersize=2.5)
+        axes.text(place, 1.01, f"n = {max(rows['num_episodes'].filter(here))}", transform=axes.get_xaxis_transform(),
+                  ha="center", color=NOTE_COLOR, size=7)  # fmt: skip
+        axes.axvline(place + 0.5, color="#E3E3E3", linewidth=0.7, zorder=0)
+    room = letters(axes, 0.85 / len(names))
+    turned = max(len(word) for name in names for word in name.split()) > room
+    look: Any = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"} if turned else {}
+    axes.set_xticks(range(len(names)), [wrapped(name, 26 if turned else room, 3) for name in names], **look)
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlim(-0.5, len(names) - 0.5)
+    axes.grid(axis="y")
+    return 3.0
+
+
+def stacked(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     """Bars of parts that are stacked in their order."""
-    names = rows.filter(pl.col(o["value"]) > 0)[o["color"]].unique(maintain_order=True).to_list()
-    places = rows[o["x"]].unique(maintain_order=True).to_list()
-    styles, bottom = group_styles(names), np.zeros(len(places))
+    names, mean = rows[o["color"]].unique(maintain_order=True).to_list(), o.get("mean")
+    places = sorted(rows[o["x"]].unique(maintain_order=True).to_list(), key=lambda place: place == mean)
+    x = np.array([i + _APART * (place == mean) for i, place in enumerate(places)])
+    styles, bottom, between = group_styles(names), np.zeros(len(places)), "\n" if is_narrow(axes) else "  "
     for name in names:
-        part = dict(rows.filter(pl.col(o["color"]) == name).select(o["x"], o["value"]).iter_rows())
-        values = np.array([part.get(place, 0.0) for place in places])
-        axes.bar(range(len(places)), values, 0.8, bottom, facecolor=styles[name]["color"], hatch=styles[name]["hatch"],
-                 edgecolor="white", linewidth=0.4, label=shortened(name, 26))  # fmt: skip
+        part = {row[o["x"]]: row for row in rows.filter(pl.col(o["color"]) == name).iter_rows(named=True)}
+        values = np.array([part[place][o["value"]] if place in part else 0.0 for place in places])
+        if not values.any():
+            continue
+        said = [cell(part[mean], Column(o["value"], "percent"))] if mean in part else []
+        axes.bar(x, values, 0.8, bottom, facecolor=styles[name]["color"], hatch=styles[name]["hatch"],
+                 edgecolor="white", linewidth=0.4, label=between.join([shortened(name, 26), *said]))  # fmt: skip
         bottom = bottom + values
-    label_positions(axes.xaxis, [str(place) for place in places], _MOST_LABELS)
+    label_positions(axes.xaxis, [str(place) for place in places if place != mean], _most_labels(axes))
+    if mean in places:
+        ticks, labels = axes.get_xticks(), [text.get_text() for text in axes.get_xticklabels()]
+        axes.set_xticks([*ticks, x[-1]], [*labels, "all"])
     axes.set_ylim(0, max(1.0, float(bottom.max(initial=0))))
     share_ticks(axes.yaxis)
+    axes.set_xlim(-0.6, x[-1] + 0.6)
+    return max(3.0, 0.2 * (1 + (1 + between.count("\n")) * len(names)))
 
 
-def _distribution(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+def _distribution(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     places = rows[o["x"]].unique(maintain_order=True).to_list()
     generator = np.random.default_rng(0)
     for place, name in enumerate(places):
@@ -291,23 +366,27 @@ def _distribution(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
         axes.axhline(float(np.median(uniform)), color=BASELINE_COLOR, linestyle="--", linewidth=1, label=BASELINE_NAME)
         if (low := uniform.min()) < (high := uniform.max()):
             axes.axhspan(low, high, color="#E6E6E6", linewidth=0, zorder=0, label="its range over the episodes")
-    label_positions(axes.xaxis, [str(place) for place in places], _MOST_LABELS)
+    label_positions(axes.xaxis, [str(place) for place in places], _most_labels(axes))
     axes.grid(axis="y")
+    return 3.0
 
 
-def _scatter(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
-    (x, left, right), (y, low, high) = _bounds(rows, o["x"]), _bounds(rows, o["y"])
+def _scatter(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
+    x, (y, low, high) = rows[o["x"]].cast(pl.Float64).to_numpy(), _bounds(rows, o["y"])
     colors = _colors_of(axes, rows, o)
-    axes.hlines(y, left, right, color=colors, linewidth=1)
-    axes.vlines(x, low, high, color=colors, linewidth=1)
-    axes.scatter(x, y, c=colors, s=18, zorder=3)
-    for number, i in enumerate(np.argsort(-y)):  # above and below their points in turn, so that neighbours do not touch
-        name, offset = shortened(str(rows[o["label"]][int(i)]), 24), (4, -8 if number % 2 else 3)
-        axes.annotate(name, (x[i], y[i]), offset, textcoords="offset points", size=7)
-    if o.get("log"):
-        ratio_axis(axes.xaxis, np.concatenate([x, left, right]))
-        ratio_axis(axes.yaxis, np.concatenate([y, low, high]))
+    baseline, even = ([o[name]] if name in o else [] for name in ("baseline", "x_baseline"))
+    ends = x.min(), x.max()
+    room = (ends[1] / ends[0]) ** 0.08  # for names
+    ratio_axis(axes.xaxis, [*even, ends[0] / room, ends[1] * room])
+    _log_axis(axes, x, (y, low, high), baseline)
+    axes.vlines(x, low, high, color=colors, linewidth=0.8, alpha=0.5)
+    axes.scatter(x, y, c=colors, s=14, zorder=3)
+    for at in even:
+        axes.axvline(at, color=BASELINE_COLOR, linestyle=":", linewidth=0.8, label=BASELINE_NAME)
+    for at in baseline:
+        axes.axhline(at, color=BASELINE_COLOR, linestyle="--", linewidth=0.8, label=o.get("baseline_name"))
     axes.grid()
+    return 3.4 if rows.height < _MANY_POINTS else 4.6
 
 
 #: The colours of a map: less than uniform attention (as the linguistic group), as much, more (as the visual group), and
@@ -317,7 +396,7 @@ _STOPS, _NO_VALUE, _LEAST_FACTOR = ("#A63C00", "#E69A6B", "#F7F7F7", "#7FB2D3", 
 _MOST_NUMBERS, _MOST_NUMBERED_COLUMNS = 64, 12
 
 
-def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     """Factors as colours around 1, the first row at the bottom; infinite ones and 0 have the ends of the colours.
 
     With `share` the values are shares: 0 to 1, from white on. In a small map every cell also shows its number.
@@ -349,10 +428,15 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     bar.ax.yaxis.set_major_formatter(lambda value, _: written(value))
     bar.set_label(wrapped(o.get("label", o["value"]), 20, 3))
     bar.outline.set_visible(False)
-    label_positions(axes.xaxis, [str(one) for one in columns], _MOST_LABELS)
+    label_positions(axes.xaxis, [str(one) for one in columns], _most_labels(axes))
     label_positions(axes.yaxis, [str(one) for one in lines], _MOST_LABELS)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
+    return 0.9 + min(6.0, 0.3 * len(lines))
+
+
+def _most_labels(axes: Axes) -> int:
+    return min(_MOST_LABELS, letters(axes, 0.2))
 
 
 def _percent(value: float) -> str:
@@ -366,12 +450,8 @@ def _factor(value: float) -> str:
     return f"{value:.3g}" if f"{value:.3g}" == "1" or value > 1 else f"1/{1 / value:.3g}"
 
 
-#: Kind -> its function, and the inches that its axes are high.
-_KINDS: dict[str, tuple[Callable[[Axes, pl.DataFrame, Options], None], Callable[[pl.DataFrame, Options], float]]] = {
-    "forest": (_forest, lambda rows, o: 0.55 + (0.17 if rows.height > 30 else 0.21) * max(rows.height, 2)),
-    "lines": (lines, lambda rows, o: 3.0),
-    "stacked": (stacked, lambda rows, o: 3.0),
-    "distribution": (_distribution, lambda rows, o: 3.0),
-    "heat_map": (_heat_map, lambda rows, o: 0.9 + min(6.0, 0.3 * rows[o["y"]].n_unique())),
-    "scatter": (_scatter, lambda rows, o: 3.4),
-}
+#: Kind -> its function, which returns the inches that its axes are high.
+_KINDS: dict[str, Callable[[Axes, pl.DataFrame, Options], float]] = {
+    "forest": _forest, "lines": lines, "courses": _courses, "stacked": stacked, "distribution": _distribution,
+    "heat_map": _heat_map, "scatter": _scatter,
+}  # fmt: skip

@@ -22,6 +22,13 @@ if TYPE_CHECKING:
 StyleName: TypeAlias = Literal["screen", "paper"]
 #: Columns of a page in a two-column paper, in inches: one, and both.
 _ONE_COLUMN, _BOTH_COLUMNS = 3.35, 6.9
+#: Digits at the ticks of a logarithmic axis that spans less than so many decades.
+_TICKS = (
+    (0.5, (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)),
+    (1.0, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)),
+    (3.4, (1.0, 2.0, 5.0)),
+    (np.inf, (1.0,)),
+)
 #: Of rows of pictures on a screen, in inches.
 _WIDE = 8.4
 #: Dots per inch in a notebook, whose pages are about 900 dots wide.
@@ -166,6 +173,21 @@ def explain(axes: Axes, text: str) -> None:
     axes.text(0.5, 0.5, textwrap.fill(text, 60), transform=axes.transAxes, ha="center", va="center", color=NOTE_COLOR)
 
 
+def is_narrow(axes: Axes) -> bool:
+    """Whether the picture has the width of one column."""
+    return _inches(axes) < 1.2 * _ONE_COLUMN
+
+
+def letters(axes: Axes, part: float) -> int:
+    """How many letters of a tick's label fit into a part of the picture's width."""
+    return int(part * _inches(axes) / (0.058 if is_narrow(axes) else 0.067))
+
+
+def _inches(axes: Axes) -> float:
+    canvas: Any = axes.figure
+    return float(canvas.get_figwidth())
+
+
 def ratio_axis(axis: Any, values: Any) -> None:
     """Make an x or y axis logarithmic around finite positive values, with decimal numbers (0.5, 20) as labels.
 
@@ -179,12 +201,14 @@ def ratio_axis(axis: Any, values: Any) -> None:
     # At least half a factor of two on either side, so that tiny differences do not look large.
     margin = max(0.06 * np.log(high / low), 0.5 * (np.log(2.0) - np.log(high / low)), 0.05)
     low, high = low * np.exp(-margin), high * np.exp(margin)
-    decades = np.log10(high / low)
-    digits = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if decades < 1.0 else (1.0, 2.0, 5.0) if decades < 3 else (1.0,)
     is_x = axis.axis_name == "x"
+    # Numbers below a narrow picture would touch.
+    narrow = is_x and is_narrow(axis.axes)
+    decades = np.log10(high / low) * (1.6 if narrow else 1.0)
+    digits = next(digits for most, digits in _TICKS if decades < most)
     (axis.axes.set_xscale if is_x else axis.axes.set_yscale)("log")
     (axis.axes.set_xlim if is_x else axis.axes.set_ylim)(low, high)
-    axis.set_major_locator(LogLocator(subs=digits, numticks=20))
+    axis.set_major_locator(LogLocator(subs=digits, numticks=4 if narrow else 20))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
     axis.set_minor_locator(NullLocator())
 

@@ -26,6 +26,8 @@ MORE, GRIPPER_MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
 #: A word without which it is more, and with another word in its place is not shown to be.
 NOT_EXCHANGED = "more, but not with another word"
 _SHOWN_KINDS = ("without", "only", "prompt", "image")
+#: Points and courses in pictures: of items that are `MORE`, and of the others.
+_SHOWN, _NOT_SHOWN = "more than another noise seed", "not shown to be more"
 #: In the order of tables and pictures.
 _KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "token", "exchange")
 _READERS = ("total", "direct", "pictures", "text")
@@ -174,16 +176,21 @@ def figures_of_items(
     forest = {"value": "effect", "label": "label", "xlabel": change, "log": True, **floor, **by_kind}
     title = "How the action changes without it, or with it exchanged"
     found = [Figure("effects_by_item", "forest", items, title, n.format("bars"), forest)]
-    if course["phase"].n_unique() > 1:
-        lines = {"x": "phase", "value": "effect", "color": "label", "log": True, "ylabel": change,
-                 "xlabel": "time (0: first replan, 1: end)", "colors": {"another noise seed": "#7F7F7F"}}  # fmt: skip
+    shown = pl.when(pl.col("than_noise") == MORE).then(pl.lit(_SHOWN)).otherwise(pl.lit(_NOT_SHOWN))
+    by_noise = {"color": "shown", "colors": {_SHOWN: "#0072B2", _NOT_SHOWN: "#8F8F8F"}}
+    if course.filter(pl.col("kind") != "noise")["phase"].n_unique() > 1:
+        found_of = items.select("condition", shown=shown).unique("condition")
+        course = course.join(found_of, "condition", "left", maintain_order="left")
+        look = {"x": "phase", "value": "effect", "label": "label", "reference": "another noise seed", "ylabel": change,
+                "xlabel": "each strip: from the first policy call to the end", **by_noise}  # fmt: skip
         title = "How the action changes without it, over an episode"
-        found.append(Figure("effects_over_time", "lines", course, title, n.format("bands"), lines))
+        found.append(Figure("effects_over_time", "courses", course, title, n.format("bands"), look))
     rows = items.filter(pl.col("item_kind").is_in(["word", "object"]), kind="without").drop_nulls("lift")
     if rows.height > 1:
-        points = {"x": "lift", "y": "effect", "label": "label", "log": True, **by_kind,
+        points = {"x": "lift", "y": "effect", "label": "label", "x_baseline": 1.0, **floor, **by_noise,
                   "xlabel": "attention per token, evenly spread = 1", "ylabel": change}  # fmt: skip
         title = "Attention to it, and how the action changes without it"
+        rows = rows.with_columns(shown=shown)
         found.append(Figure("attention_and_effect", "scatter", rows, title, n.format("bars"), points))
     return found
 
