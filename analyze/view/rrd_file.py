@@ -1,19 +1,23 @@
-"""An episode as a Rerun recording (`.rrd`): pictures, words, numbers, poses and events on one time line.
+"""An episode as a Rerun recording (`.rrd`): pictures, words, numbers, poses and events on two time lines.
 
-Times are steps of the environment: a replan stands at the number of steps before it, a pose at the step that led to it.
-Numbers are means over layers, denoise steps and heads, the same as on the page. Entities:
+`step` counts the environment's: a replan stands at the number of steps before it, a pose at the step that led to it.
+`call` counts the policy's: what stands at a step stands at the call that was executed then. Numbers are means over
+layers, denoise steps and heads, the same as on the page. Entities:
 
+    /                          the classes: a number, name and colour for every object
     about                      what happened, and what the numbers are
     pictures/CAMERA            what the policy got, as a person sees the scene; below it the lines around the patches
-                               that get so many times even attention, pictures/CAMERA/2 times even
+                               that get so many times even attention, pictures/CAMERA/2 times even, and the outlines of
+                               objects that the sentence names or that were touched, pictures/CAMERA/objects/NAME
     words                      the instruction with attention and effect of every word, as a table
     ratio, masses, attention   by replan: the ratio and what even attention gives; mass of groups; times even of words
+    heads/most                 by replan: which head looks most at the named object, or at what is first on the page
     effects                    by replan: how the action changes without an item, in its units
     scene                      by step: hand and objects in 3D, in metres
     actions                    by step: what was executed, a number a dimension; else the actions that were returned
     events                     touches, reached goals, closings of the gripper, the end
 
-Where a run has several sites, SITE stands before pictures, words, ratio, masses and attention.
+Where a run has several sites, SITE stands before pictures, words, ratio, masses, attention and heads.
 """
 
 from __future__ import annotations
@@ -23,8 +27,9 @@ import shlex
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -53,7 +58,7 @@ if TYPE_CHECKING:
     import rerun
 
 SUFFIX = ".rrd"
-TIMELINE = "step"
+STEP, CALL = "step", "call"
 _MARKDOWN = "text/markdown"
 #: The oldest release that has every call below; LeRobot 0.4 takes it, too.
 OLDEST = (0, 24)
@@ -61,6 +66,10 @@ OLDEST = (0, 24)
 #: negative numbers.
 _LINES = ((0x00, 0xB5, 0xCC), (0xE0, 0x40, 0xA0))
 _WIDE = 1.2
+#: By object what Rerun knows of it: its number, label and colour.
+Classes: TypeAlias = dict[str, tuple[int, str, tuple[int, int, int]]]
+#: Colours of objects, on the page too: named in the sentence, touched, others.
+_NAMED, _TOUCHED, _OTHER = (0x00, 0xC0, 0x8B), (0xFF, 0x6A, 0x1F), (0x99, 0x99, 0x99)
 #: Curves that others are held against, and their colour, which light and dark viewers show.
 _BASELINES, _BASELINE_COLOR = ("spread evenly", "another noise seed"), "#8F8F8F"
 #: An action in a simulator of ours.
@@ -122,12 +131,21 @@ class Logged:
         kind: a type of Rerun's.
         values: its fields, by their names there; with several steps a row for each of them.
         steps: at which it stands; None: throughout.
+        call: at which it stands; None: at those that were executed from its steps on.
     """
 
     place: tuple[str, ...]
     kind: str
     values: Mapping[str, Any]
     steps: int | Sequence[int] | None = None
+    call: int | None = None
+
+    def times(self, starts: Sequence[int]) -> dict[str, Any]:
+        """Where it stands on each time line, as its steps are given; starts: the step of every call."""
+        if self.steps is None:
+            return {}
+        executed = np.searchsorted(starts, self.steps, "right") - 1
+        return {STEP: self.steps, CALL: executed.tolist() if self.call is None else self.call}
 
 
 def logged(
@@ -137,22 +155,26 @@ def logged(
 
     about: of `ShownEpisode`; effects: of `shown_effects`, in `units`, none where none was measured.
     """
-    starts = about["starts"]
+    starts, classes = about["starts"], _classes(shown)
+    if classes:
+        yield Logged((), "AnnotationContext", {"context": list(classes.values())})
     yield Logged(("about",), "TextDocument", {"text": _about(shown, about, units), "media_type": _MARKDOWN})
     sites = [site.name for site in shown.store.attributes.sites]
     for site in sites:
         before = (site,) if len(sites) > 1 else ()
         maps = episode_maps(shown.question(site), shown.item(site), seen_cameras(shown.item(site)))
-        yield from _pictures(before, shown, maps, starts)
+        yield from _pictures(before, shown, maps, classes, starts)
         yield from _words(before, maps, effects, starts)
         yield from _groups(before, shown.groups(site, MEAN, MEAN), starts)
+        for target in about["sites"][site]["targets"][:1]:
+            yield from _heads(before, target["name"], shown.grid(site, target["selector"]), starts)
     for kind in _kinds(effects):
         curves = {item["label"]: item["effect"] for item in effects if _kind(item) == kind}
         yield from _series(("effects", kind), starts, curves)
-    yield from _scene(shown)
+    yield from _scene(shown, classes, starts)
     yield from _actions(shown, about)
     for event in about["events"]:
-        yield Logged(("events",), "TextLog", {"text": event["text"]}, event["step"])
+        yield Logged(("events",), "TextLog", {"text": event["text"]}, event["step"], event["replan"])
 
 
 def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionUnits | None) -> None:
@@ -169,19 +191,20 @@ def _write(rr: Any, path: Path, shown: ShownEpisode, units: ActionUnits | None) 
     if about["courses"]:
         stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for one in logged(shown, about, effects, units):
-        _log(rr, stream, one)
+        _log(rr, stream, one, about["starts"])
     path.write_bytes(memory.drain_as_bytes())
     stream.disconnect()
 
 
-def _log(rr: Any, stream: rerun.RecordingStream, one: Logged) -> None:
+def _log(rr: Any, stream: rerun.RecordingStream, one: Logged, starts: Sequence[int]) -> None:
     place, kind = _path(rr, one.place), getattr(rr, one.kind)
+    times = one.times(starts)
     if isinstance(one.steps, Sequence):
-        times = rr.TimeColumn(TIMELINE, sequence=list(one.steps))
-        stream.send_columns(place, [times], kind.columns(**one.values))
+        columns = [rr.TimeColumn(name, sequence=list(numbers)) for name, numbers in times.items()]
+        stream.send_columns(place, columns, kind.columns(**one.values))
         return
-    if one.steps is not None:
-        stream.set_time(TIMELINE, sequence=one.steps)
+    for name, number in times.items():
+        stream.set_time(name, sequence=number)
     stream.log(place, kind(**one.values), static=one.steps is None)
 
 
@@ -208,6 +231,7 @@ def _about(shown: ShownEpisode, about: Mapping[str, Any], units: ActionUnits | N
         f"{about['episode']}; policy {visible(root.policy.name)}; run {shown.store.run[:8]}.\n\nAttention of the "
         "action queries, mean over layers, denoise steps and heads. *Times even*: what a word or patch gets, divided "
         "by what it would get if attention were spread evenly."
+        + (" *Outlines*: green, what the sentence names; orange, what was touched." if about["objects"] else "")
         + ("" if units is None else f" *Effect*: without the item, {units.said('so much')} ({units.title}).")
     )
 
@@ -234,15 +258,33 @@ def _kind(item: Mapping[str, Any]) -> str:
     return str(item["item_kind"] if item["kind"] == "without" else item["kind"])
 
 
+def _classes(shown: ShownEpisode) -> Classes:
+    """Every object's class."""
+    attributes = shown.episode.attributes
+    touched = () if attributes.steps is None else attributes.steps.touched
+    found = {}
+    for number, name in enumerate(thing.name for thing in attributes.objects):
+        named = " (named)", _NAMED
+        what, color = named if name in shown.named else (" (touched)", _TOUCHED) if name in touched else ("", _OTHER)
+        found[name] = number, _spelled(name) + what, color
+    return found
+
+
+def _spelled(name: str) -> str:
+    return visible(name.replace("_", " "))
+
+
 def _pictures(
-    before: tuple[str, ...], shown: ShownEpisode, maps: EpisodeMaps, starts: Sequence[int]
+    before: tuple[str, ...], shown: ShownEpisode, maps: EpisodeMaps, classes: Classes, starts: Sequence[int]
 ) -> Iterator[Logged]:
-    """What the policy got, with lines around the patches that get much more than even attention."""
+    """What the policy got, with lines around the patches that get much more than even attention, and around objects."""
     lifts = [one.lift.ravel() for one in maps.cameras.values()]
     levels = line_levels(scale_end(np.concatenate(lifts))) if lifts else []
     for camera, one in maps.cameras.items():
         place, grid = (*before, "pictures", camera), one.picture.grids[0]
         sides = float(grid.image_width), float(grid.image_height)
+        covered = shown.covered(maps.item.tokens.layout.name).get(camera, {})
+        outlined = [name for name in covered if classes[name][2] != _OTHER]
         for replan, step in enumerate(starts):
             if maps.has_frames(camera):
                 png = {"contents": shown.picture(camera, replan), "media_type": "image/png"}
@@ -252,6 +294,12 @@ def _pictures(
                 around = borders(lift >= level, 0.1 * number, (0.0, 0.0), sides)
                 lines = {"strips": [(one[:2], one[2:]) for one in around], "colors": [color], "radii": -_WIDE}
                 yield Logged((*place, f"{level:g} times even"), "LineStrips2D", lines, step)
+            for name in outlined:
+                inside = np.isin(np.arange(lift.size), covered[name][replan]).reshape(lift.shape)
+                strips = [(one[:2], one[2:]) for one in borders(inside, 0.2, (0.0, 0.0), sides)]
+                # Rerun would write the name at each strip.
+                lines = {"strips": strips, "class_ids": [classes[name][0]], "radii": -_WIDE, "show_labels": False}
+                yield Logged((*place, "objects", _spelled(name)), "LineStrips2D", lines, step)
 
 
 def _words(
@@ -284,26 +332,42 @@ def _groups(before: tuple[str, ...], groups: Mapping[str, Any], starts: Sequence
         yield from _series((*before, "ratio"), starts, {name: [line[-1] for line in of] for name, of in ratios.items()})
 
 
-def _scene(shown: ShownEpisode) -> Iterator[Logged]:
+def _heads(before: tuple[str, ...], target: str, grid: Mapping[str, Any], starts: Sequence[int]) -> Iterator[Logged]:
+    """The head that looks most at a target, as the page marks it in its grid; none where the target is out of sight."""
+    most: list[float | None] = []
+    for lifts, step in zip(grid["lift"], starts, strict=True):
+        heads = zip(product(grid["layers"], grid["heads"]), chain.from_iterable(lifts), strict=True)
+        known = [(lift, *head) for head, lift in heads if lift is not None]
+        lift, layer, head = max(known, key=lambda one: one[0], default=(None, None, None))
+        said = f"layer {layer}, head {head}: {lift:.3g} times even on" if known else "out of sight:"
+        yield Logged((*before, "heads", "most"), "TextLog", {"text": f"{said} {target}"}, step)
+        most.append(lift)
+    yield from _series((*before, "heads"), starts, {"most": most})
+
+
+def _scene(shown: ShownEpisode, classes: Classes, starts: Sequence[int]) -> Iterator[Logged]:
     """Hand and objects where they were at every step; the hand with the axes of its own frame and its way."""
     steps = shown.episode.attributes.steps
     if steps is None:
         return
     poses = shown.episode.read(POSES).astype(np.float64)  # (moment, body, position and w, x, y, z)
+    # Of all rows of a call Rerun shows the one that was logged last: here the pose that the call saw.
+    between = [moment for moment in range(len(poses)) if moment not in starts]
     for i, body in enumerate(steps.bodies):
-        name = visible(body.replace("_", " "))
+        name = _spelled(body)
         turned = np.roll(poses[:, i, 3:], -1, axis=1)  # Rerun has w last
         moved = {"translation": poses[:, i, :3], "quaternion": turned}
-        yield Logged(("scene", name), "Transform3D", moved, range(len(poses)))
+        for moments in filter(None, (between, starts)):
+            values = {what: numbers[moments] for what, numbers in moved.items()}
+            yield Logged(("scene", name), "Transform3D", values, moments)
         if body == HAND:
             axes = {"vectors": np.eye(3) * _AXES, "colors": _AXIS_COLORS, "radii": _AXES / 16}
             yield Logged(("scene", name, "axes"), "Arrows3D", axes)
             way = {"strips": [poses[:, i, :3]], "colors": [(0x88, 0x88, 0x88)], "radii": _AXES / 40}
             yield Logged(("scene", "way of the hand"), "LineStrips3D", way)
         else:
-            named = body in shown.named
-            color = (0xE6, 0x9F, 0x00) if named else (0x99, 0x99, 0x99)
-            mark = {"half_sizes": [_MARK] * 3, "colors": [color], "labels": [name + " (named)" * named]}
+            number, label, _ = classes[body]
+            mark = {"half_sizes": [_MARK] * 3, "class_ids": [number], "labels": [label]}
             yield Logged(("scene", name, "mark"), "Boxes3D", mark)
 
 
@@ -348,7 +412,12 @@ def _blueprint(rr: Any, about: Mapping[str, Any], kinds: Collection[str]) -> Any
     ]
     scene = [rrb.Spatial3DView(origin="/scene", name="scene (m)")] if about["courses"] else []
     left = [rrb.Horizontal(*pictures)] * bool(pictures)
-    left += [rrb.Horizontal(rrb.Vertical(*texts), *scene), rrb.TextLogView(origin="/events", name="events")]
+    heads = [
+        *[rrb.TextLogView(**place(site, "heads", name="which head looks most")) for site in sites],
+        *[rrb.TimeSeriesView(**place(site, "heads", name="its times even")) for site in sites],
+    ]
+    logs = rrb.Horizontal(rrb.TextLogView(origin="/events", name="events"), rrb.Tabs(*heads))
+    left += [rrb.Horizontal(rrb.Vertical(*texts), *scene), logs]
     plots = [
         *[rrb.TimeSeriesView(**place(site, "ratio", name="ratio, and if spread evenly")) for site in sites],
         *[rrb.TimeSeriesView(**place(site, "masses", name="attention on groups")) for site in sites],
@@ -369,4 +438,4 @@ def _blueprint(rr: Any, about: Mapping[str, Any], kinds: Collection[str]) -> Any
 
 
 def _path(rr: Any, parts: Sequence[str]) -> str:
-    return "/".join(rr.escape_entity_path_part(part) for part in parts)
+    return "/" + "/".join(rr.escape_entity_path_part(part) for part in parts)

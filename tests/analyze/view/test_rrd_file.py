@@ -25,9 +25,25 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.core.action_changes import units_of
 from vla_attention.analyze.view import rrd_file
 from vla_attention.analyze.view.episode_answers import ShownEpisode
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 
-SPEC = StoreSpec(tasks=(0, 1), replans=3, plant_effects=planted_effects(), plant_steps=small_steps)
+
+def gone_in_call_1(_task: int, _episode: int, tokens: EpisodeTokens) -> dict[str, np.ndarray]:
+    """`PlantCoverage`: random; in the second call there is background alone."""
+    found = {camera: coverage.copy() for camera, coverage in tokens.coverage.items()}
+    for coverage in found.values():
+        coverage[1] = [thing.kind == "background" for thing in tokens.objects]
+    return found
+
+
+SPEC = StoreSpec(
+    tasks=(0, 1),
+    replans=4,  # the touch, in the middle, is where a call begins
+    plant_effects=planted_effects(),
+    plant_steps=small_steps,
+    plant_coverage=gone_in_call_1,
+)
 
 
 def test_a_library_that_is_missing_or_too_old_is_named(tmp_path, capsys, monkeypatch):
@@ -57,7 +73,10 @@ Recording = dict[str, dict[str, dict[int | None, Any]]]
 
 
 def read_again(path: Path) -> Recording:
-    """Entity -> column -> step (None: throughout) -> what was logged there; Rerun's reader has read it."""
+    """Entity -> column -> step (None: throughout) -> what was logged there; Rerun's reader has read it.
+
+    The column `call` is the place on the other time line.
+    """
     reader = pytest.importorskip("rerun.chunk", reason="only newer releases of rerun-sdk have this reader")
     found: Recording = {}
     for chunk in reader.RrdReader(path).stream().to_chunks():
@@ -77,13 +96,18 @@ def as_logged(path: Path, name: str) -> Recording:
     shown = ShownEpisode(store, episode)
     units = units_of([store]) if episode.attributes.effects else None
     effects = [] if units is None else rrd_file.shown_effects(shown, units)
-    for one in rrd_file.logged(shown, shown.about(), effects, units):
+    about = shown.about()
+    for one in rrd_file.logged(shown, about, effects, units):
+        columns, many = found.setdefault("/" + "/".join(one.place), {}), isinstance(one.steps, Sequence)
         for field, values in one.values.items():
-            column = found.setdefault("/" + "/".join(one.place), {}).setdefault(f"{one.kind}:{field}", {})
-            if isinstance(one.steps, Sequence):
+            column = columns.setdefault(f"{one.kind}:{field}", {})
+            if many:
                 column.update((step, [value]) for step, value in zip(one.steps, values, strict=True))
             else:
-                column[one.steps] = values if field in ("strips", "colors", "labels") else [values]
+                column[one.steps] = values if field in ("strips", "colors", "labels", "class_ids") else [values]
+        if one.steps is not None:
+            (_, steps), (name, calls) = one.times(about["starts"]).items()
+            columns.setdefault(name, {}).update(zip(steps, calls, strict=True) if many else {steps: calls})
     return found
 
 
@@ -188,16 +212,114 @@ def test_pictures_are_the_stored_ones_and_lines_go_around_what_gets_twice_even(s
     hold_pictures(store, episode, recording, starts)
 
 
-def test_pictures_of_a_mirrored_camera_and_the_mark_of_what_is_named():
+def test_pictures_and_outlines_of_a_mirrored_camera_and_the_mark_of_what_is_named():
     path = example_store("cubes")
     (episode,) = [one for one in open_store(path).episodes if one.name == "task001_episode000"]
     assert any(camera.mirrored for camera in open_store(path).attributes.policy.cameras)
     steps = episode.read("env_step").astype(int)
     recording = as_logged(path, episode.name)
     hold_pictures(path, episode, recording, (steps - steps[0]).tolist())
-    marks = {entity: columns["Boxes3D:colors"][None] for entity, columns in recording.items() if "/mark" in entity}
-    colored = [entity for entity, [color] in marks.items() if len({*color}) > 1]
-    assert (len(marks), colored) == (3, ["/scene/green cube/mark"])
+    hold_outlines(path, episode, recording, (steps - steps[0]).tolist())
+    marks = {entity: columns["Boxes3D:class_ids"][None] for entity, columns in recording.items() if "/mark" in entity}
+    labels = {entity: classes_of(recording)[number][0] for entity, [number] in marks.items()}
+    assert labels == {
+        "/scene/red cube/mark": "red cube",
+        "/scene/green cube/mark": "green cube (named)",
+        "/scene/blue cube/mark": "blue cube",
+    }
+
+
+def test_outlines_go_around_the_patches_of_named_and_touched_objects(store, episode, recording, starts):
+    hold_outlines(store, episode, recording, starts)
+
+
+def test_what_was_touched_though_another_was_named_has_a_class_of_its_own_colour():
+    path = example_store("cubes_one_colour")
+    store = open_store(path)
+    (one,) = [one for one in store.episodes if one.attributes.steps.touched == ("blue_cube",)][:1]
+    recording = as_logged(path, one.name)
+    assert ShownEpisode(store, one).named == {"red_cube"}
+    assert dict(classes_of(recording).values())["blue cube (touched)"] == (0xFF, 0x6A, 0x1F)
+    steps = one.read("env_step").astype(int)
+    hold_outlines(path, one, recording, (steps - steps[0]).tolist())
+
+
+def classes_of(recording: Recording) -> dict[int, tuple[str, tuple[int, int, int]]]:
+    """Number -> label and colour of Rerun's classes."""
+    ((classes,),) = recording["/"]["AnnotationContext:context"].values()
+    if isinstance(classes[0], tuple):
+        return {number: (label, color) for number, label, color in classes}
+    read = [one["class_description"]["info"] for one in classes]
+    return {one["id"]: (one["label"], tuple(one["color"].to_bytes(4, "big")[:3])) for one in read}
+
+
+def hold_outlines(store: Path, episode: StoredEpisode, recording: Recording, starts: list[int]) -> None:
+    """Rays from the left cross an object's outline an odd number of times on their way to the cells that it covers."""
+    shown, classes = ShownEpisode(open_store(store), episode), classes_of(recording)
+    assert [label.split(" (")[0] for label, _ in classes.values()] == [
+        thing.name.replace("_", " ") for thing in episode.attributes.objects
+    ]
+    touched = {*episode.attributes.steps.touched}
+    numbers = {thing.name: number for number, thing in enumerate(episode.attributes.objects)}
+    drawn = 0
+    for camera, how in shown.about()["sites"]["joint"]["cameras"].items():
+        sides = np.array([how["width"], how["height"]]) / (how["columns"], how["rows"])
+        for name, cells in shown.covered("joint").get(camera, {}).items():
+            columns = recording.get(f"/pictures/{camera}/objects/{name.replace('_', ' ')}")
+            assert (columns is not None) == (name in shown.named | touched)
+            for replan, step in enumerate(starts) if columns else ():
+                assert columns["LineStrips2D:class_ids"][step] == [numbers[name]]
+                own = columns["LineStrips2D:strips"].get(step, [])
+                inside = []
+                for row, column in np.ndindex(how["rows"], how["columns"]):
+                    x, y = (np.array([column, row]) + 0.5) * sides
+                    crossed = [a for a, b in own if a[0] == b[0] < x and min(a[1], b[1]) < y < max(a[1], b[1])]
+                    inside += [row * how["columns"] + column] * (len(crossed) % 2)
+                assert inside == cells[replan]
+                drawn += len(inside)
+    assert drawn
+
+
+def test_the_head_that_looks_most_is_that_of_the_grid(store, episode, recording, starts):
+    shown = ShownEpisode(open_store(store), episode)
+    target = shown.targets("joint")[0]
+    assert target["name"].endswith("(named)")
+    grid, most = shown.grid("joint", target["selector"]), curves(recording, "heads")["most"]
+    lifts = np.array(grid["lift"], dtype=float)
+    said = {step: text for step, [text] in recording["/heads/most"]["TextLog:text"].items()}
+    assert most.keys() == {*starts} - {starts[1]}
+    assert said[starts[1]] == f"out of sight: {target['name']}"
+    for replan in (0, 2, 3):
+        highest = most[starts[replan]]
+        assert highest == lifts[replan].max()
+        ((i,), (j,)) = np.nonzero(lifts[replan] == highest)
+        where = f"layer {grid['layers'][i]}, head {grid['heads'][j]}"
+        assert said[starts[replan]] == f"{where}: {highest:.3g} times even on {target['name']}"
+
+
+def test_no_head_looks_at_what_is_out_of_sight():
+    grid = {"layers": [3, 5], "heads": [0, 1], "lift": [[[None, None], [None, None]], [[0.5, 1.0], [7.0, 7.0]]]}
+    first, second, series, _look = rrd_file._heads(("self",), "red cube", grid, [0, 5])
+    assert first.values["text"] == "out of sight: red cube"
+    assert second.values["text"] == "layer 5, head 0: 7 times even on red cube"
+    assert (series.place, series.steps, series.values) == (("self", "heads", "most"), [5], {"scalars": [7.0]})
+
+
+def test_by_call_everything_stands_where_it_was_executed_and_poses_where_they_were_seen(episode, recording, starts):
+    places = set()
+    for entity, columns in recording.items():
+        calls = columns.get("call", {})
+        # An event stands at the end of the step that led to it, which may be where the next call begins.
+        since = -1 if entity == "/events" else 0
+        assert calls == {step: sum(start <= step + since for start in starts) - 1 for step in calls}
+        times = [step for name, column in columns.items() if name != "call" for step in column if step is not None]
+        assert calls.keys() == {*times}
+        if "Transform3D:translation" in columns:
+            order = columns.get("rerun.controls.RowId", {step: place for place, step in enumerate(calls)})
+            shown = {calls[step]: step for step in sorted(calls, key=order.__getitem__)}  # the last of a call
+            assert (len(calls), shown) == (episode.attributes.num_steps + 1, dict(enumerate(starts)))
+        places |= {entity.split("/")[1]} if calls else set()
+    assert places > {"pictures", "words", "ratio", "heads", "effects", "scene", "actions", "events"}
 
 
 def hold_pictures(store: Path, episode: StoredEpisode, recording: Recording, starts: list[int]) -> None:
