@@ -360,6 +360,7 @@ def test_a_walk_by_keyboard_comes_back_to_its_card(view, server):
         page.keyboard.press("Tab")
         seen.add(page.evaluate("document.activeElement.tagName"))
     assert {"BUTTON", "svg", "SELECT"} <= seen
+    page.locator(".stack svg").first.focus()
     page.keyboard.press("Escape")
     view.settle()
     page.wait_for_selector("[data-episode=task000_episode001]:focus")
