@@ -269,13 +269,16 @@ class ShownEpisode:
         """
         item, at = self.item(site), check_replan(self.item(site), replan)
         rows = self.rows(site, layer, heads=True)[at].mean(axis=0)  # (head, key)
-        uniform = self.uniform(site, layer).mean(axis=1)
-        even = uniform[min(at, len(uniform) - 1)]
+        selection = replace(self._selection(site, layer), per_head=True)
+        uniform = uniform_keys(item, selection)[:, 0].mean(axis=1)
+        valid, even = item.valid[min(at, len(item.valid) - 1)], uniform[min(at, len(uniform) - 1)]  # (head or 1, key)
+        # As much mass as the valid keys have, shared out as uniform attention does.
+        even = even * (rows[:, valid].sum(axis=1) / even[:, valid].sum(axis=1))[:, None]
         cameras = {}
         for camera in seen_cameras(item):
             picture, view = PictureMap.of(item.tokens.layout, camera), view_of(item, camera)
             with np.errstate(divide="ignore", invalid="ignore"):
-                lift = picture.spread(rows[:, picture.keys]) / picture.spread(even[picture.keys])
+                lift = picture.spread(rows[:, picture.keys]) / picture.spread(even[:, picture.keys])
             shown = [upright(one, view).ravel() for one in lift]
             covered = self.covered(site).get(camera, {})
             cameras[camera] = {

@@ -18,11 +18,11 @@ from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import select
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import UnknownName, UserError
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
 from vla_attention.schemas.groupings.selector_parser import parse_selector
-from vla_attention.schemas.groupings.selectors import quoted
+from vla_attention.schemas.groupings.selectors import SelectorError, quoted
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 #: What stands for the objects that each episode's own sentence names.
@@ -38,8 +38,8 @@ def heads_of_run(store: Store, site: str, layer: int, selector: str, first: int)
 
     Returns:
         heads: their numbers. episodes: each with lift (replan, head), and that of the layer as a whole (replan), null
-        where none of it is in sight; episodes without any of it, or that cannot be read, are left out. next: where the
-        next answer begins; null: nowhere.
+        where none of it is there; episodes without any of it are left out. failed: names of those that cannot be read.
+        next: where the next answer begins; null: nowhere.
 
     Raises:
         SelectorError: it is none.
@@ -50,16 +50,17 @@ def heads_of_run(store: Store, site: str, layer: int, selector: str, first: int)
         parse_selector(selector)
     batch = store.episodes[first : first + _AT_ONCE]
     end = first + len(batch)
-    settings = AnalysisSettings(site=site, layers=(layer,))
+    settings, failed = AnalysisSettings(site=site, layers=(layer,)), list[str]()
     return {
         "heads": list(store.attributes.recording_of(site).heads),
-        "episodes": list(_measured(store, batch, settings, selector)) if batch else [],
+        "episodes": list(_measured(store, batch, settings, selector, failed)) if batch else [],
+        "failed": failed,
         "next": end if end < len(store.episodes) else None,
     }
 
 
 def _measured(
-    store: Store, batch: Sequence[StoredEpisode], settings: AnalysisSettings, selector: str
+    store: Store, batch: Sequence[StoredEpisode], settings: AnalysisSettings, selector: str, failed: list[str]
 ) -> Iterator[dict[str, Any]]:
     items_of = _named_items if selector == NAMED else partial(selected_items, selectors=(selector,), absent="zero")
     try:
@@ -67,10 +68,17 @@ def _measured(
         if selector != NAMED:
             check_names(Grouping("heads", {"target": (selector,)}), question.vocabulary)
         found = [_lifts(one) for one in measure(question, items_of, ("head",))]
-    except UserError:
-        if len(batch) > 1:  # one of them is the reason
+    except (SelectorError, UnknownName):  # none of them has what it names, or one alone has
+        if len(batch) > 1:
             for episode in batch:
-                yield from _measured(store, [episode], settings, selector)
+                yield from _measured(store, [episode], settings, selector, failed)
+        return
+    except UserError:
+        if len(batch) == 1:
+            failed.append(batch[0].name)
+        else:  # one of them is the reason
+            for episode in batch:
+                yield from _measured(store, [episode], settings, selector, failed)
         return
     for item, lifts in zip(question.selected, found, strict=True):
         if any(one is not None for one in lifts["layer"]):

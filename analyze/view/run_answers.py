@@ -57,6 +57,8 @@ def _run_answer(store: Store, known: KnownLines) -> dict[str, Any]:
             {
                 "name": site.name,
                 "keys": site.num_keys,
+                "pictured": bool(site.pictured),
+                "spelled": any(span.kind == "text" for span in site.spans),
                 "layers": list(root.recording_of(site.name).layer_labels),
                 "heads": list(root.recording_of(site.name).heads),
                 "denoise_steps": list(root.recording.denoise_steps),

@@ -119,6 +119,8 @@ class _Readable:
         except UserError:
             return
         found[name] = [*map(_shown, result.findings)]
+        if name == "language":  # which says it of what can be read wholly
+            found["done"] = []
         leaves: dict[str, int] = {}
         for table in result.tables:
             if table.name == "failures":
@@ -149,7 +151,7 @@ def _shown(finding: Finding) -> dict[str, str]:
 
 
 def _so_far(found: Mapping[str, Sequence[dict[str, str]]]) -> dict[str, Any]:
-    """Every sentence once; what was done stands first until `language` says it, too."""
+    """Every sentence once; what was done stands first until `language` says it."""
     each = [one for findings in found.values() for one in findings]
     return {"findings": list({one["sentence"]: one for one in each}.values())}
 
@@ -166,6 +168,8 @@ def _effects(readable: _Readable) -> Iterator[dict[str, Any]]:
     rows = found.episodes()
     exchanged = rows.filter(kind="prompt", item_kind="exchange")
     words = exchanged if exchanged.height else rows.filter(kind="without", item_kind="word")
+    by_all = words.filter(pl.col("reader") == "total")  # where that was tried, as the page shows it
+    words = words if exchanged.height else by_all if by_all.height else words.filter(reader="direct")
     means = words.group_by("task_id", "episode_index", maintain_order=True).agg(pl.mean("effect")).drop_nulls()
     title = f"{found.units.title}, words {'exchanged' if exchanged.height else 'left out'}"
     yield {

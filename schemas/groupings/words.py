@@ -9,12 +9,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Literal
+from unicodedata import category
 
 from vla_attention.schemas.layout import Piece, Prompt
 
 WordClass = Literal["content", "stop"]
 
-_WORD = re.compile(r"\w+(?:['\u2019-]\w+)*")
+
+@functools.cache
+def _word() -> re.Pattern[str]:
+    """A word: letters with the vowel signs and accents that stand on them, which Python's own \\w leaves out."""
+    marks = "".join(letter for letter in map(chr, range(0x300, 0x10000)) if category(letter) in ("Mn", "Mc"))
+    part = f"\\w[\\w{marks}]*"
+    return re.compile(f"{part}(?:['\u2019-]{part})*")
 
 
 @dataclass(frozen=True)
@@ -29,7 +36,7 @@ class Word:
 
 def split_words(text: str) -> list[tuple[int, int]]:
     """Character ranges [start, stop) of the words of a text; underscores separate words as they do for the policies."""
-    return [match.span() for match in _WORD.finditer(text.replace("_", " "))]
+    return [match.span() for match in _word().finditer(text.replace("_", " "))]
 
 
 def folded_words(text: str) -> tuple[str, ...]:

@@ -66,6 +66,8 @@ def test_role_codes_never_change():
 def test_words_split_at_spaces_underscores_and_punctuation():
     text = "Pick_up the O'Brien's hand-held mug, (red)."
     assert [text[a:b] for a, b in split_words(text)] == ["Pick", "up", "the", "O'Brien's", "hand-held", "mug", "red"]
+    text = "हिन्दी में प्याला, cafe\u0301!"  # vowel signs and accents belong to their words
+    assert [text[a:b] for a, b in split_words(text)] == ["हिन्दी", "में", "प्याला", "cafe\u0301"]
 
 
 def test_words_stop_at_the_instruction():

@@ -222,6 +222,27 @@ def test_what_heads_look_at_in_a_call_is_of_their_rows(server):
         assert set(given[camera]["named"]) == expected
 
 
+def test_where_heads_see_different_keys_each_is_beside_its_own_even_attention(server):
+    about = read(server, "masks", "about.json")
+    layer = read_path(server, "runs.json")["runs"][NAMES.index("masks")]["sites"][0]["layers"][0]
+    given = read(server, "masks", f"joint/call/{layer}/0.json")
+    for camera, how in about["sites"]["joint"]["cameras"].items():
+        for key, cell in list(zip(how["keys"], how["cells"], strict=True))[:4]:
+            grid = read(server, "masks", f"joint/grid.json?selector=keys:{key}-{key}")
+            expected = numbers(grid["lift"])[0, grid["layers"].index(layer)]
+            np.testing.assert_allclose(numbers(given[camera]["lift"])[:, cell], expected, rtol=1e-3)
+
+
+def test_episodes_that_cannot_be_read_are_named_beside_the_others(places, tmp_path):
+    broken = shutil.copytree(places["steps"], tmp_path / "broken.zarr")
+    (broken / "episodes/task000_episode000/joint/key_role/c.0.0").unlink()
+    with served(broken) as server:
+        given = read_path(server, "runs/0/heads.json?site=joint&layer=0&selector=role:instruction&first=0")
+    names = [one.name for one in open_store(broken).episodes]
+    assert given["failed"] == ["task000_episode000"]
+    assert [one["name"] for one in given["episodes"]] == [name for name in names if name != "task000_episode000"]
+
+
 @pytest.mark.parametrize(
     "query",
     ["", "?site=joint&layer=0&selector=named", "?site=no&layer=0&selector=named&first=0",

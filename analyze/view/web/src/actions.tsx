@@ -46,7 +46,7 @@ export function Actions() {
             ; <span class="without">dashed: {whose}</span>
           </>
         ) : part("without") && about.value.value?.effects ? (
-          `; no call without ${part("without")} was recorded`
+          `; ${part("without")} was not recorded at this call`
         ) : (
           ""
         )}

@@ -28,6 +28,9 @@ export interface EpisodeLine {
 export interface SiteAxes {
   readonly name: string;
   readonly keys: number;
+  /** Whether it has patches of pictures, and text. */
+  readonly pictured: boolean;
+  readonly spelled: boolean;
   readonly layers: readonly number[];
   readonly heads: readonly number[];
   readonly denoise_steps: readonly number[];
@@ -157,6 +160,8 @@ export interface HeadLifts {
 export interface HeadsOfRun {
   readonly heads: readonly number[];
   readonly episodes: readonly { name: string; lift: Grid; layer: readonly (number | null)[] }[];
+  /** Those that cannot be read. */
+  readonly failed: readonly string[];
   /** Where the next answer begins. */
   readonly next: number | null;
 }
@@ -243,13 +248,22 @@ function inside(address: string): Uint8Array<ArrayBuffer> {
 /** What keeps the page from answering anything: the server has ended, or its store is gone; as a sentence, or empty. */
 export const trouble = signal("");
 const GONE = 410;
+/** Of which run it is, as its addresses begin; empty: of all. */
+let troubled = "";
 
 async function answerTo(address: string): Promise<Response> {
   const reply = await fetch(address).catch(() => null);
-  if (reply?.status === GONE) trouble.value = await saidBy(reply, address);
-  else if (reply) trouble.value = "";
-  else trouble.value = "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.";
-  if (!reply || trouble.value) throw new Error(reply || !isFolder ? trouble.value : `Nobody answers for ${address}.`);
+  if (reply?.status === GONE) {
+    troubled = /^runs\/\d+\//.exec(address)?.[0] ?? "";
+    trouble.value = await saidBy(reply, address);
+    throw new Error(trouble.value);
+  }
+  if (!reply) {
+    troubled = "";
+    trouble.value = "Nobody answers: vla-attention view has ended. Start it again, and load this page anew.";
+    throw new Error(isFolder ? `Nobody answers for ${address}.` : trouble.value);
+  }
+  if (address.startsWith(troubled)) trouble.value = "";
   return reply;
 }
 

@@ -52,9 +52,10 @@ export const taken = computed<Effect | null>(() => tried.value.get(part("without
 export interface OfWord {
   readonly removed: readonly number[];
   readonly exchanged: readonly number[];
-  /** The others, as "'blue' or 'green'". */
+  /** The others, as "'blue' or 'green'", of which it is the mean; and each by itself. */
   readonly others: string;
-  /** What names its removal. */
+  readonly each: readonly { label: string; sizes: readonly number[] }[];
+  /** What names the largest exchange, or its removal. */
   readonly label: string;
 }
 
@@ -63,8 +64,10 @@ export function ofWord(text: string): OfWord {
   const own = [...tried.value.values()].filter(({ item }) => item === text.toLowerCase());
   const [without] = own.filter(({ kind, item_kind }) => kind === "without" && item_kind === "word");
   const exchanges = own.filter(({ kind, item_kind }) => kind === "prompt" && item_kind === "exchange");
+  const each = exchanges.map((one) => ({ label: one.label, sizes: sizesOf(one) })).sort((a, b) => (b.sizes[0] || 0) - (a.sizes[0] || 0));
   const others = exchanges.map(({ instead }) => `'${instead}'`).join(" or ");
-  return { removed: without ? sizesOf(without) : [], exchanged: meanOf(exchanges.map(sizesOf)), others, label: without?.label ?? "" };
+  const label = each[0]?.label ?? without?.label ?? "";
+  return { removed: without ? sizesOf(without) : [], exchanged: meanOf(each.map(({ sizes }) => sizes)), others, each, label };
 }
 
 /** Whether words were exchanged: then that is what colours them. */
@@ -76,8 +79,8 @@ export const noise = computed(() => (seed.value ? sizesOf(seed.value) : []));
 /** What fills a word with colour, (part): of other units than centimetres, degrees and gripper the largest of the episode. */
 const full = computed(() =>
   (effects.value.value?.parts ?? []).map((one, i) => {
-    const sizes = [...tried.value.values()].map((effect) => sizesOf(effect)[i]!).filter(Number.isFinite);
-    return one.full ?? Math.max(4 * (noise.value[i] || 0), ...sizes, 1e-9);
+    const sizes = [...tried.value.values()].flatMap(({ effect }) => effect[i]!.map((size) => size ?? 0));
+    return one.full ?? Math.max(4 * (seed.value?.mean[i] || 0), ...sizes, 1e-9);
   }),
 );
 
@@ -99,11 +102,9 @@ export const said = (sizes: readonly number[]): string =>
 export function EffectsOfWords({ texts }: { texts: readonly string[] }) {
   const parts = effects.value.value?.parts ?? [];
   const rows = [...new Set(texts)].flatMap((text) => {
-    const { removed, exchanged, others } = ofWord(text);
-    return [
-      ...(exchanged.length ? [[`'${text}' as ${others}`, exchanged] as const] : []),
-      ...(removed.length ? [[`'${text}' left out`, removed] as const] : []),
-    ];
+    const { removed, each } = ofWord(text);
+    const left = removed.length ? [[`'${text}' left out`, removed] as const] : [];
+    return [...each.map(({ label, sizes }) => [label, sizes] as const), ...left];
   });
   if (!rows.length) return null;
   return (
@@ -151,12 +152,19 @@ export function EffectTable() {
   });
   const first = each[0];
   if (!first) return null;
-  const size = (one: Effect, at: number): number => (shade.value === "effects" ? one.mean[0] : one.effect[0]![at]) ?? 0;
-  const rows = [...first.items.values()].sort((a, b) => size(b, first.side.at) - size(a, first.side.at));
+  const union = new Map(each.flatMap(({ items }) => [...items]).reverse());
+  const sizeOf = (label: string): number => {
+    const of = each.find(({ items }) => items.has(label))!;
+    const one = of.items.get(label)!;
+    return (shade.value === "effects" ? one.mean[0] : one.effect[0]![of.side.at]) ?? 0;
+  };
+  const rows = [...union.values()].sort((a, b) => sizeOf(b.label) - sizeOf(a.label));
   const place = rows.findIndex(({ kind }) => kind === "noise");
-  const counts = rows.map(({ effect }) => effect[0]!.filter((value) => value !== null).length);
-  const [fewest, most] = [Math.min(...counts), Math.max(...counts)];
-  const calls = `${fewest < most ? `${fewest} to ` : ""}${most} ${most === 1 ? "call" : "calls"}`;
+  const callsOf = ({ items }: Told): string => {
+    const counts = [...items.values()].map(({ effect }) => effect[0]!.filter((value) => value !== null).length);
+    const [fewest, most] = [Math.min(...counts), Math.max(...counts)];
+    return `episode (${fewest < most ? `${fewest} to ` : ""}${most} ${most === 1 ? "call" : "calls"})`;
+  };
   const further = each.length === 1 ? first.effects.parts.slice(1) : [];
   return (
     <section class="effects" aria-label="Effects">
@@ -178,12 +186,12 @@ export function EffectTable() {
             ))}
           </tr>
           <tr>
-            {each.flatMap(({ side }) => [
-              <th key={`now ${nameOf(side)}`}>this call</th>,
-              <th key={`all ${nameOf(side)}`}>episode ({calls})</th>,
+            {each.flatMap((told) => [
+              <th key={`now ${nameOf(told.side)}`}>this call</th>,
+              <th key={`all ${nameOf(told.side)}`}>{callsOf(told)}</th>,
             ])}
             {further.map(({ name }) => (
-              <th key={name}>episode ({calls})</th>
+              <th key={name}>{callsOf(first)}</th>
             ))}
           </tr>
         </thead>
@@ -226,7 +234,7 @@ export function EffectTable() {
           {note}
         </p>
       ))}
-      {part("without") ? null : <span class="soft"> Click one: the actions without it are drawn below.</span>}
+      {part("without") || !tried.value.size ? null : <span class="soft"> Click one: the actions of that call are drawn below.</span>}
     </section>
   );
 }

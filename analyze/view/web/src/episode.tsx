@@ -13,16 +13,19 @@ import {
   about,
   axes,
   beside,
+  besideKnown,
   closeEpisode,
   denoise,
   episodeName,
   type groups,
   head,
+  headsKnown,
   layer,
   layerPlace,
   main,
   nameInRun,
   nameOf,
+  OTHER_SITE,
   onlyEpisode,
   part,
   replan,
@@ -77,10 +80,7 @@ function Controls() {
       {sites.length > 1 ? (
         <label>
           site{" "}
-          <select
-            value={site.value}
-            onChange={(event) => setPart({ site: event.currentTarget.value, layer: "mean", head: "mean", group: "" })}
-          >
+          <select value={site.value} onChange={(event) => setPart({ ...OTHER_SITE, site: event.currentTarget.value })}>
             {sites.map(({ name }) => (
               <option value={name}>{name}</option>
             ))}
@@ -88,12 +88,7 @@ function Controls() {
         </label>
       ) : null}
       <Choose name="layer" title="layer" known={axes.value?.layers ?? []} value={layer.value} />
-      <Choose
-        name="head"
-        title="head"
-        known={runs.value.value?.copy?.heads === false ? [] : (axes.value?.heads ?? [])}
-        value={head.value}
-      />
+      <Choose name="head" title="head" known={headsKnown.value} value={head.value} />
       <Choose name="denoise" title="denoise step" known={axes.value?.denoise_steps ?? []} value={denoise.value} />
       <ChooseBeside />
       <button class="options" aria-expanded={options.value} onClick={() => (options.value = !options.value)}>
@@ -139,7 +134,7 @@ function ChooseBeside() {
           ))}
         </select>
       </label>
-      {part("beside") ? <button onClick={swap}>⇄ swap</button> : null}
+      {part("beside") && besideKnown.value ? <button onClick={swap}>⇄ swap</button> : null}
     </>
   ) : null;
 }
@@ -169,6 +164,12 @@ function Banners({ scene }: { scene: Scene }) {
 /** Two episodes at the same step: pictures with the same lines, what they came to, and their ratios. */
 function SideBySide() {
   const other = beside.about.value;
+  if (runs.value.value && !besideKnown.value)
+    return (
+      <p class="error" role="alert">
+        There is no other episode '{part("beside")}' to compare with.
+      </p>
+    );
   if (other.error)
     return (
       <p class="error" role="alert">
@@ -194,6 +195,11 @@ function SideBySide() {
             <p class="soft">
               step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}
             </p>
+            {scene.rows.value.error ? (
+              <p class="error" role="alert">
+                {scene.rows.value.error}
+              </p>
+            ) : null}
           </div>
         );
       })}
@@ -272,7 +278,7 @@ export function EpisodePage() {
   const { value: episode, error } = about.value;
   const back = onlyEpisode.value ? null : (
     <button class="back" onClick={closeEpisode}>
-      ← episodes
+      ← {part("of") ? `layer ${layer.value}, head ${head.value}` : "episodes"}
     </button>
   );
   const isListed = run.value?.episodes.some(({ name }) => name === episodeName.value) ?? true;
@@ -344,7 +350,7 @@ export function EpisodePage() {
           <OwnGroup />
         </aside>
       </div>
-      {rows.value.error ? (
+      {rows.value.error && !isBeside ? (
         <p class="error" role="alert">
           {rows.value.error}
         </p>

@@ -1,11 +1,11 @@
 /** One head over all episodes and policy calls of a run, beside its layer; and small maps of all heads of a layer. */
 import { computed, effect, signal } from "@preact/signals";
-import { useEffect, useState } from "preact/hooks";
+import { useLayoutEffect, useState } from "preact/hooks";
 
-import { address, type CallMaps, type HeadsOfRun, pictureAt, readJson } from "./answers";
+import { address, type CallMaps, type HeadsOfRun, NEEDS_SERVER, pictureAt, readJson } from "./answers";
 import { kindOf, mark } from "./overview";
-import { Strokes } from "./pictures";
-import { axes, closeEpisode, head, layer, part, run, runNumber, setPart, site, step } from "./state";
+import { coming, Strokes } from "./pictures";
+import { axes, closeEpisode, head, layer, OTHER_SITE, part, run, runNumber, runs, setPart, site, step } from "./state";
 import { meanOf, outline, shown } from "./sums";
 
 /** Lines of small maps stand at so many times even attention, whatever the episode reaches. */
@@ -17,37 +17,44 @@ const FIRST_CALLS = 24;
 interface Found {
   readonly heads: readonly number[];
   readonly episodes: HeadsOfRun["episodes"];
+  readonly failed: readonly string[];
   /** Episodes that were asked for. */
   readonly read: number;
   readonly error: string | null;
 }
 
-const target = computed(() => part("target") || NAMED);
+const target = computed(() => part("target") || (axes.value?.pictured === false ? "role:instruction" : NAMED));
 const found = signal<Found | null>(null);
 effect(() => {
   found.value = null;
-  if (part("of") !== "head" || !run.value || layer.value === "mean") return;
+  if (part("of") !== "head" || part("episode") || !run.value || layer.value === "mean" || runs.value.value?.copy) return;
   const [ofRun, total] = [runNumber.value, run.value.episodes.length];
   const asked = { site: site.value, layer: `${layer.value}`, selector: target.value };
   let live = true;
   const read = async (): Promise<void> => {
     const episodes: HeadsOfRun["episodes"][number][] = [];
+    const failed: string[] = [];
     for (let first: number | null = 0; live && first !== null; ) {
       const answer: HeadsOfRun = await readJson(`runs/${ofRun}/heads.json?${new URLSearchParams({ ...asked, first: `${first}` })}`);
       episodes.push(...answer.episodes);
+      failed.push(...answer.failed);
       first = answer.next;
-      if (live) found.value = { heads: answer.heads, episodes: [...episodes], read: first ?? total, error: null };
+      if (live) found.value = { heads: answer.heads, episodes: [...episodes], failed, read: first ?? total, error: null };
     }
   };
   read().catch((error: Error) => {
-    if (live) found.value = { heads: [], episodes: [], read: 0, error: error.message };
+    if (live) found.value = { heads: [], episodes: [], failed: [], read: 0, error: error.message };
   });
   return () => {
     live = false;
   };
 });
 export const headRead = computed(
-  () => part("of") !== "head" || (found.value !== null && (found.value.error !== null || found.value.read === run.value?.episodes.length)),
+  () =>
+    part("of") !== "head" ||
+    layer.value === "mean" ||
+    runs.value.value?.copy !== undefined ||
+    (found.value !== null && (found.value.error !== null || found.value.read === run.value?.episodes.length)),
 );
 
 interface Call {
@@ -115,11 +122,13 @@ function Thumbnail({
 function useMaps(name: string, replan: number): CallMaps | string | null {
   const at = `${address.episode(runNumber.value, name)}/${site.value}/call/${layer.value}/${replan}.json`;
   const [maps, setMaps] = useState<readonly [string, CallMaps | string] | null>(null);
-  useEffect(() => {
-    readJson<CallMaps>(at).then(
-      (read) => setMaps([at, read]),
+  useLayoutEffect(() => {
+    coming.value++;
+    const read = readJson<CallMaps>(at).then(
+      (maps) => setMaps([at, maps]),
       (error: Error) => setMaps([at, error.message]),
     );
+    void read.finally(() => coming.value--);
   }, [at]);
   return maps?.[0] === at ? maps[1] : null;
 }
@@ -128,12 +137,14 @@ function CallCard({ call: { episode, replan, lift, layer: ofLayer } }: { call: C
   const maps = useMaps(episode, replan);
   const line = run.value!.episodes.find(({ name }) => name === episode)!;
   return (
-    <button class={`card ${kindOf(line)}`} title={line.verdict} onClick={() => step({ of: "", episode, replan })}>
+    <button class={`card ${kindOf(line)}`} title={line.verdict} onClick={() => step({ episode, replan })}>
       <span class="thumbnails">
         {maps === null ? (
           <span class="no-picture">…</span>
         ) : typeof maps === "string" ? (
           maps
+        ) : !Object.keys(maps).length && line.picture ? (
+          <img src={pictureAt(address.picture(runNumber.value, episode, line.picture[0], replan))} alt="" loading="lazy" />
         ) : (
           Object.keys(maps).map((camera) => (
             <Thumbnail key={camera} name={episode} replan={replan} camera={camera} maps={maps} ofHead={place.value} />
@@ -150,16 +161,27 @@ function CallCard({ call: { episode, replan, lift, layer: ofLayer } }: { call: C
   );
 }
 
-const TARGETS = { [NAMED]: "what the sentence names", "role:image": "all pictures", "role:instruction": "the instruction" };
-
-/** Named objects, pictures, the instruction, every word of the run's sentences; and what the link has. */
+/** Named objects, pictures, the instruction, every word of the run's sentences, as far as the site has them; and what the link
+ * has. */
 const targets = computed<Record<string, string>>(() => {
-  const words = new Set(
-    (run.value?.episodes ?? []).flatMap(({ told }) => (told ?? "").toLowerCase().split(/[^\p{L}\p{N}'_-]+/u)).filter(Boolean),
-  );
-  const known = { ...TARGETS, ...Object.fromEntries([...words].slice(0, 60).map((word) => [`word:"${word}"`, `'${word}'`])) };
+  const { pictured, spelled } = axes.value ?? { pictured: true, spelled: true };
+  const told = (run.value?.episodes ?? []).flatMap((line) => (line.told ?? "").toLowerCase().split(/[^\p{L}\p{M}\p{N}'’-]+/u));
+  const words = [...new Set(told.filter(Boolean))].slice(0, 60).map((word) => [`word:"${word}"`, `'${word}'`] as const);
+  const known = {
+    ...(pictured ? { [NAMED]: "what the sentence names", "role:image": "all pictures" } : {}),
+    ...(spelled ? { "role:instruction": "the instruction", ...Object.fromEntries(words) } : {}),
+  };
   return { ...known, [target.value]: known[target.value as keyof typeof known] ?? target.value };
 });
+
+/** What was found of how many episodes. */
+function foundIn({ episodes, failed, read }: Found): string {
+  const total = run.value!.episodes.length;
+  const left = failed.length ? ` ${failed.length} cannot be read.` : "";
+  if (read < total) return `Read ${read} of ${total} episodes.${left}`;
+  if (!episodes.length) return `No episode has any of ${targets.value[target.value]}.${left}`;
+  return `There in ${episodes.length} of ${read} episodes, ${calls.value.length} policy calls.${left}`;
+}
 
 export function HeadPage() {
   const numbers = found.value;
@@ -167,6 +189,15 @@ export function HeadPage() {
   const [many, setMany] = useState(FIRST_CALLS);
   const means = averages.value;
   const chosen = head.value === "mean" || layer.value === "mean";
+  if (runs.value.value?.copy)
+    return (
+      <div class="head-page">
+        <button class="back" onClick={closeEpisode}>
+          ← episodes
+        </button>
+        <p>{NEEDS_SERVER}</p>
+      </div>
+    );
   return (
     <div class="head-page">
       <header>
@@ -174,8 +205,21 @@ export function HeadPage() {
           ← episodes
         </button>
         <h1>{chosen ? "One head over all episodes" : `Layer ${layer.value}, head ${head.value} in all episodes`}</h1>
+        <p class="soft">of {run.value?.name}</p>
       </header>
       <div class="controls open">
+        {(run.value?.sites.length ?? 0) > 1 ? (
+          <label>
+            site{" "}
+            <select value={site.value} onChange={(event) => setPart({ ...OTHER_SITE, site: event.currentTarget.value })}>
+              {run.value!.sites.map(({ name }) => (
+                <option key={name} value={name}>
+                  {name}
+                </option>
+              ))}
+            </select>
+          </label>
+        ) : null}
         {(
           [
             ["layer", axes.value?.layers, layer.value],
@@ -230,12 +274,7 @@ export function HeadPage() {
       ) : (
         <>
           <p role="status" class={headRead.value ? "soft" : ""}>
-            {headRead.value ? "" : `Read ${numbers.read} of ${run.value!.episodes.length} episodes. `}
-            {numbers.episodes.length
-              ? `In sight in ${numbers.episodes.length} of ${numbers.read} episodes, ${calls.value.length} policy calls.`
-              : headRead.value
-                ? "No episode has any of it in sight."
-                : ""}
+            {foundIn(numbers)}
           </p>
           {numbers.episodes.length ? (
             <>

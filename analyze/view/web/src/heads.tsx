@@ -4,6 +4,7 @@ import { address, type HeadLifts, readJson } from "./answers";
 import { LayerMaps, NAMED } from "./head";
 import {
   answered,
+  axes,
   beside,
   cellsOf,
   head,
@@ -39,6 +40,7 @@ function targetsOf(scene: Scene): readonly Target[] {
   );
   const patches = keys.map((key) => `keys:${key}-${key}`).join(" | ");
   const { selector } = picked.value;
+  if (runs.value.value?.copy) return known; // it answers no questions
   return [
     ...known,
     ...(patches ? [{ id: "patches", name: "the clicked patches", path: asked(patches) }] : []),
@@ -165,9 +167,11 @@ function OfLayer() {
   return (
     <>
       <p>
-        <button aria-expanded={opened.value} onClick={() => (opened.value = !opened.value)}>
-          all heads of layer {layer.value} in this call
-        </button>{" "}
+        {axes.value?.pictured ? (
+          <button aria-expanded={opened.value} onClick={() => (opened.value = !opened.value)}>
+            all heads of layer {layer.value} in this call
+          </button>
+        ) : null}{" "}
         {head.value === "mean" ? null : (
           <button
             onClick={() =>
@@ -178,6 +182,7 @@ function OfLayer() {
                 without: "",
                 step: "",
                 replan: 0,
+                denoise: "mean",
                 of: "head",
                 target: named ? NAMED : target.value!.id,
               })
@@ -187,7 +192,7 @@ function OfLayer() {
           </button>
         )}
       </p>
-      {opened.value ? <LayerMaps name={main.name.value} replan={replan.value} /> : null}
+      {opened.value && axes.value?.pictured ? <LayerMaps name={main.name.value} replan={replan.value} /> : null}
     </>
   );
 }

@@ -89,7 +89,8 @@ const page = document.getElementById("page")!;
 render(<App />, page);
 effect(() => {
   const line = run.value?.episodes.find(({ name }) => name === episodeName.value);
-  const ofHead = part("of") === "head" ? `layer ${layer.value}, head ${head.value} · ${run.value?.name}` : run.value?.name;
+  const one = layer.value === "mean" || head.value === "mean" ? "one head" : `layer ${layer.value}, head ${head.value}`;
+  const ofHead = part("of") === "head" ? `${one} · ${run.value?.name}` : run.value?.name;
   const shown = line ? `task ${line.task}, episode ${line.episode} · ${run.value!.name}` : ofHead;
   document.title = shown ? `${shown} · Attention` : "Attention";
 });

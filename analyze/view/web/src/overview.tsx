@@ -1,7 +1,7 @@
 /** The first page: what the run shows, and its episodes as pictures, task by task. */
 import { computed, signal } from "@preact/signals";
 
-import { address, type EpisodeLine, pictureAt } from "./answers";
+import { address, type EpisodeLine, pictureAt, trouble } from "./answers";
 import { openEpisode, part, run, runNumber, runNumbers, runs, setPart } from "./state";
 import { shown } from "./sums";
 
@@ -209,6 +209,7 @@ function Findings() {
       </section>
     );
   }
+  if (trouble.value) return null; // nobody computes
   return <section class="findings soft">{numbers?.failed ?? "What the run shows is being computed …"}</section>;
 }
 

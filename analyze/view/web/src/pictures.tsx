@@ -17,6 +17,7 @@ import {
   massesAt,
   massesOf,
   numReplans,
+  OTHER_SITE,
   picked,
   type Scene,
   setPart,
@@ -154,8 +155,10 @@ function usePicture({ scene, camera, how, at }: At): { readonly at: number; read
   const wanted = (replan: number): string => address.picture(scene.run.value, scene.name.value, camera, replan);
   const [shown, setShown] = useState({ at, url: "", of: "" });
   const [of, last] = [`${scene.run.value} ${scene.name.value}`, (scene.about.value.value?.starts.length ?? 1) - 1];
+  // While another episode comes, what is known is of the one before.
+  const isOf = !scene.about.value.pending;
   useLayoutEffect(() => {
-    if (!how.stored) return;
+    if (!how.stored || !isOf) return;
     let live = true;
     const show = (url: string): void => {
       if (live) setShown({ at, url, of });
@@ -167,7 +170,7 @@ function usePicture({ scene, camera, how, at }: At): { readonly at: number; read
     return () => {
       live = false;
     };
-  }, [at, of, how.stored]);
+  }, [at, of, how.stored, isOf]);
   return how.stored && shown.of === of ? shown : { at, url: "" };
 }
 
@@ -237,7 +240,7 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
     return (
       <p>
         The keys of this site are no patches of pictures.{" "}
-        {other ? <button onClick={() => setPart({ site: other })}>Show site {other}</button> : null}
+        {other ? <button onClick={() => setPart({ ...OTHER_SITE, site: other })}>Show site {other}</button> : null}
       </p>
     );
   }

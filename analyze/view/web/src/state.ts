@@ -129,9 +129,10 @@ export function openEpisode(episode: string): void {
   step({ ...CLOSED, episode });
 }
 
-/** Shows the overview. */
+/** Shows the overview; behind an episode that was opened from a head's page, that one. */
 export function closeEpisode(): void {
-  step(CLOSED);
+  const { episode, replan, group, without, beside: other, step: at } = CLOSED;
+  step(part("episode") && part("of") ? { episode, replan, group, without, beside: other, step: at } : CLOSED);
 }
 
 export const runs = answered(() => readRuns());
@@ -156,7 +157,7 @@ effect(() => {
     const numbers = await readJsonNow<RunNumbers>(address.numbers(wanted)).catch(() => null);
     if (runNumber.peek() !== wanted) return;
     if (numbers) runNumbers.value = numbers;
-    if (numbers && !numbers.complete) timer = setTimeout(() => void read(), AGAIN_MS);
+    if (!numbers?.complete) timer = setTimeout(() => void read(), AGAIN_MS);
   };
   void read();
   return () => clearTimeout(timer);
@@ -179,7 +180,9 @@ const choice = (name: "layer" | "head" | "denoise", known: () => readonly number
     return given !== "mean" && known().includes(Number(given)) ? Number(given) : "mean";
   });
 export const layer = choice("layer", () => axes.value?.layers ?? []);
-export const head = choice("head", () => axes.value?.heads ?? []);
+/** Those whose rows are there: a copy may have none of them. */
+export const headsKnown = computed(() => (runs.value.value?.copy?.heads === false ? [] : (axes.value?.heads ?? [])));
+export const head = choice("head", () => headsKnown.value);
 export const denoise = choice("denoise", () => axes.value?.denoise_steps ?? []);
 const position = (known: readonly number[] | undefined, chosen: Choice): Choice =>
   chosen === "mean" ? chosen : (known ?? []).indexOf(chosen);
@@ -207,6 +210,9 @@ export const picked = computed<Picked>(() => {
   }
   return { cells, words: chosen, selector };
 });
+
+/** What another site has not, or others. */
+export const OTHER_SITE = { layer: "mean", head: "mean", group: "", target: "", without: "" };
 
 /** An episode with what was read of it, for the chosen site, layer, head and denoise step. */
 export interface Scene {
@@ -274,9 +280,15 @@ export const numReplans = computed(() => about.value.value?.starts.length ?? 0);
 
 /** The episode beside it, in the link as RUN:EPISODE. */
 const besideParts = computed(() => part("beside").split(":"));
+const besideRun = computed(() => Number(besideParts.value[0]) || 0);
+/** Whether there is such an episode, and it is another one. */
+export const besideKnown = computed(() => {
+  const known = runs.value.value?.runs[besideRun.value]?.episodes.some(({ name }) => name === besideParts.value[1]) ?? false;
+  return known && !(besideRun.value === runNumber.value && besideParts.value[1] === episodeName.value);
+});
 export const beside = sceneOf(
-  computed(() => Number(besideParts.value[0]) || 0),
-  computed(() => besideParts.value[1] ?? ""),
+  besideRun,
+  computed(() => (besideKnown.value ? besideParts.value[1]! : "")),
 );
 
 const startsOf = (scene: Scene): readonly number[] => scene.about.value.value?.starts ?? [];

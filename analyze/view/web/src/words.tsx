@@ -4,7 +4,7 @@ import { computed } from "@preact/signals";
 import type { SiteLayout } from "./answers";
 import { EffectsOfWords, effects, exchangesKnown, noise, ofWord, said, shade, strength } from "./effects";
 import { Hint } from "./hint";
-import { about, groupOf, layout, massesAt, picked, replan, setPart, site, step, toggled, uniformAt, words } from "./state";
+import { about, groupOf, layout, massesAt, OTHER_SITE, picked, replan, setPart, site, step, toggled, uniformAt, words } from "./state";
 import { percent, shown, sumOf } from "./sums";
 
 const once = (keys: readonly number[]): [number, number][] => keys.map((key) => [key, 1]);
@@ -34,15 +34,15 @@ const shades = computed<readonly Shaded[]>(() => {
     const lift = lifts[i]!;
     const title = [
       `attention per token: ${shown(lift)} times even`,
-      exchanged.length ? `as ${others}: ${said(exchanged)}` : "",
-      removed.length ? `left out: ${said(removed)}` : "",
-      removed.length + exchanged.length && noise.value.length ? `another noise seed: ${said(noise.value)}` : "",
+      said(exchanged) && `as ${others}: ${said(exchanged)}`,
+      said(removed) && `left out: ${said(removed)}`,
+      said([...exchanged, ...removed]) && said(noise.value) && `another noise seed: ${said(noise.value)}`,
     ];
     const own = { title: title.filter(Boolean).join("; "), none: false, line: 0 };
     if (shade.value === "attention") return { ...own, colour: Math.max(0, (lift || 0) / highest) };
     const line = exchangesKnown.value ? strength(removed) : 0;
     const colour = strength(exchangesKnown.value ? exchanged : removed);
-    return { ...own, line, colour, none: !colour && !line && removed.length + exchanged.length > 0 };
+    return { ...own, line, colour, none: !colour && !line && [...removed, ...exchanged].some(Number.isFinite) };
   });
 });
 
@@ -108,11 +108,16 @@ export function Title() {
       {spelled.value === null ? null : (
         <span class="soft">
           site {site.value} reads no words{" "}
-          {spelled.value ? <button onClick={() => setPart({ site: spelled.value!, group: "" })}>show site {spelled.value}</button> : null}
+          {spelled.value ? (
+            <button onClick={() => setPart({ ...OTHER_SITE, site: spelled.value! })}>show site {spelled.value}</button>
+          ) : null}
         </span>
       )}
       {shades.value.length && shades.value.every(({ none }) => none) ? (
         <span class="soft">no word moves the action more than another noise seed does</span>
+      ) : null}
+      {shade.value === "effect" && noise.value.length && !noise.value.some(Number.isFinite) ? (
+        <span class="soft">no effects were recorded at this call</span>
       ) : null}
       {effects.value.error ? <span class="soft">{effects.value.error}</span> : null}
     </div>
@@ -130,14 +135,14 @@ const HINTS = {
 /** What the words are shaded by. */
 export function ChooseShade() {
   const known = effects.value.value;
-  if (!known?.items.length) return <span class="soft">words shaded by attention per token</span>;
+  if (!known?.items.length) return <span class="soft">words coloured by attention per token</span>;
   const full = known.parts.flatMap((one) =>
     one.full === null ? [] : [one.said.replace("{}", one.share ? percent(one.full) : shown(one.full))],
   );
   const scale = full.length ? ` Full: ${full.join(", or ")}.` : "";
   return (
-    <fieldset class="shades" aria-label="Words shaded by">
-      words by{" "}
+    <fieldset class="shades" aria-label="Words coloured by">
+      words coloured by{" "}
       {Object.entries(SHADES).map(([name, title]) => (
         <button key={name} class="chip" aria-pressed={shade.value === name} onClick={() => setPart({ words: name })}>
           {title}
