@@ -19,11 +19,13 @@ from vla_attention.schemas.safe_text import visible
 #: Changes of actions under the conditions of `EpisodeEffects`; below each site, the weights of the keys cut for them.
 CHANGE = "effects/change"
 CUT = "cut"
+#: What `EffectMap` is of: the order of all patches by first order, and the exact changes without single ones.
+MAP, PATCH_CHANGE = "effects/map", "effects/patch_change"
 #: What is taken away, one at a time. `text`: every word of the instruction, every part of the prompt, and all of it.
 #: `cameras`: every camera's picture, and all of them. `objects`: the patches of every object. `tokens`: every key of
 #: the prompt that is no piece of a word. `groups`: every group of a grouping, and everything but the group. `prompts`:
-#: the instruction, exchanged for every other sentence of a table.
-EffectItems = Literal["text", "cameras", "objects", "tokens", "groups", "prompts"]
+#: the instruction, exchanged for every other sentence of a table. `map`: every patch, see `EffectMap`.
+EffectItems = Literal["text", "cameras", "objects", "tokens", "groups", "prompts", "map"]
 #: Whose queries no longer read it. `all`: nobody reads it. `action`: the action queries alone. `pictures`, `text`: the
 #: tokens of pictures, or of the prompt, before the denoise steps.
 EffectReaders = Literal["all", "action", "pictures", "text"]
@@ -105,6 +107,35 @@ class EffectItem(Document, frozen=True):
     reader: EffectReaders | Literal[""] = ""
 
 
+class EffectMap(Document, frozen=True):
+    """Which patches move the actions of an episode's calls, all queries without a patch at a time.
+
+    Row i of `effects/map` (row, patch) is of replan `replan[i]`: by first order, from `projections` random directions,
+    how far the first `steps` actions change without each patch, root mean square of the normalised actions. It is an
+    order; sizes are those of `effects/patch_change`, whose entry i is the exact change without patch `patch[i]` at
+    replan `patch_replan[i]`, in the units of the episode's effects. Of each replan these are its strongest patches by
+    first order, and behind them `drawn` others that were drawn at random, which say how far the order can be trusted.
+
+    keys: of the patches, at the site `site`, cameras in the order of its keys.
+    """
+
+    site: str
+    keys: tuple[int, ...]
+    projections: int
+    drawn: int
+    steps: int
+    replan: tuple[int, ...]
+    patch_replan: tuple[int, ...]
+    patch: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Check that entries are of replans and patches of the map."""
+        if len(self.patch) != len(self.patch_replan) or not set(self.patch_replan) <= set(self.replan):
+            raise BadArgument("Exact changes of a map are of other replans than its rows.")
+        if any(not 0 <= one < len(self.keys) for one in self.patch):
+            raise BadArgument(f"Exact changes of a map are of patches beyond its {len(self.keys)}.")
+
+
 class EpisodeEffects(Document, frozen=True):
     """The effects of one episode: what its arrays `effects/change` and `SITE/cut` are of.
 
@@ -112,7 +143,8 @@ class EpisodeEffects(Document, frozen=True):
     place of `items`. A replan without an entry of a condition was not measured under it: the word is not in its prompt,
     the object is out of view, the replan was skipped, or its calls were refused. `units`: how far a change of 1 moves
     the robot, by dimension of the action. `silent_blocks`: modules of a hybrid policy that ran without an attention
-    call (linear attention, state spaces): keys were cut off in the others only, whoever the reader is.
+    call (linear attention, state spaces): keys were cut off in the others only, whoever the reader is. `map`: None
+    where none was made.
     """
 
     conditions: tuple[Interventions, ...]
@@ -121,6 +153,7 @@ class EpisodeEffects(Document, frozen=True):
     replan: tuple[int, ...]
     condition: tuple[int, ...]
     silent_blocks: tuple[str, ...] = ()
+    map: EffectMap | None = None
 
     def __post_init__(self) -> None:
         """Check that each condition has its item."""

@@ -16,7 +16,7 @@ GROUPING = "grouping:"
 #: Prompt tables: the one that is made of the tasks, and the beginning of one that names a file.
 STANDARD, TABLE = "standard", "table:"
 #: What effects can be of, as it is typed.
-ITEMS = ("text", "cameras", "objects", "tokens", f"{GROUPING}FILE")
+ITEMS = ("text", "cameras", "objects", "tokens", "map", f"{GROUPING}FILE")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group, plain
 from vla_attention.capture.interventions.prompts import with_synonyms
 from vla_attention.capture.interventions.resolution import run_vocabularies
-from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy
+from vla_attention.capture.policies.policy import MapPolicy, Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.schemas.effects import EffectItem, EffectItemKind, EffectItems, EffectReaders, EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS, find_grouping
@@ -55,6 +55,10 @@ def check_effects(planned: EffectsRecorded, policy: Policy) -> None:
             f"Cannot use --effects-steps {planned.denoise_steps}; {policy.name} has {policy.num_denoise_steps} denoise "
             "steps."
         )
+    if "map" in planned.items and not isinstance(policy, MapPolicy):
+        raise BadArgument(
+            f"Cannot use --effects map with {policy.family}: its calls have no backward pass here; leave out map."
+        )
     for reader in planned.readers:
         if _READERS[reader][0] == "prefix" and not policy.has_prefix:
             raise BadArgument(
@@ -89,7 +93,8 @@ def effects_recorded(
 
 def describe_effects(planned: EffectsRecorded) -> str:
     """Return the line that is printed before a run."""
-    named = {"groups": plural(len(planned.groups), "group"), "prompts": plural(planned.most_prompts, "other prompt")}
+    named = {"map": "every patch by first order, the strongest exactly"}
+    named |= {"groups": plural(len(planned.groups), "group"), "prompts": plural(planned.most_prompts, "other prompt")}
     items = [named.get(item, item) for item in planned.items]
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import UNCHANGED, conditions_of
 from vla_attention.capture.effects.mean_pictures import MeanPictures
+from vla_attention.capture.effects.patch_maps import DRAWN, PROJECTIONS, STRONGEST, PatchOrder, patch_order
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.factors import QueryWithoutKeys, SiteEditor
 from vla_attention.capture.interventions.resolution import (
@@ -26,6 +27,7 @@ from vla_attention.capture.interventions.resolution import (
 from vla_attention.capture.interventions.run_changes import RunChanges, named_objects
 from vla_attention.capture.policies.policy import (
     CallVariant,
+    MapPolicy,
     Policy,
     PolicyInput,
     UnitsPolicy,
@@ -75,6 +77,8 @@ class EffectMeasurement:
     no_pictures: str = (
         "Cameras' pictures are exchanged for grey ones; --effects-pictures STORE takes the task's mean ones."
     )
+    #: Actions of a chunk that are executed; 0: as many as the checkpoint states.
+    executed: int = 0
     #: Whether it says what the first measured call took.
     says_seconds: bool = False
     #: See `EpisodeEffects`; None before it was looked at.
@@ -89,6 +93,12 @@ class EffectMeasurement:
     def __post_init__(self) -> None:
         """Choose how many calls are made at a time, by the memory that is left."""
         self._batch = calls_at_a_time(self.policy, self.say)
+        if "map" in self.planned.items:
+            memory = format_bytes(cast(MapPolicy, self.policy).gradient_memory())
+            self.say(
+                f"Map: {PROJECTIONS} backward passes a policy call, which take about {memory} of memory, and exact "
+                f"calls without {STRONGEST:.0%} of the patches and {DRAWN} others."
+            )
 
     def begin(self) -> EpisodeEffectsMeasured:
         """Return what measures one episode."""
@@ -182,8 +192,9 @@ def measurement_of(
     tasks: Iterable[tuple[int, str, str]],
     say: Callable[[str], None],
     pictures: MeanPictures | None = None,
+    executed: int = 0,
 ) -> EffectMeasurement | None:
-    """Return what measures a run's effects, None for none; tasks: number, instruction and family.
+    """Return what measures a run's effects, None for none; tasks: number, instruction and family; executed: see there.
 
     Raises:
         SelectorError: a group names something that no task has.
@@ -196,7 +207,7 @@ def measurement_of(
         groups = Interventions(keys=tuple(KeyKnockout(selector) for selector in planned.groups.values()))
         RunChanges(groups, instructions).check_names(policy.sites)
     siblings, told = siblings_of(known), tuple(instructions.values())
-    return EffectMeasurement(policy, planned, siblings, say, pictures, told, says_seconds=True)
+    return EffectMeasurement(policy, planned, siblings, say, pictures, told, executed=executed, says_seconds=True)
 
 
 @dataclass
@@ -252,11 +263,16 @@ class EpisodeEffectsMeasured:
             variant = self._variant(condition, policy_input, noise_seed, context, tokens, vocabularies)
             if variant is not None:
                 variants[number] = variant
+        order = self._order(policy_input, noise_seed, context, len(actions)) if "map" in planned.items else None
+        # Calls without a patch are numbered behind those of the conditions, and made together with them.
+        behind = len(self.conditions)
+        patches = {} if order is None else order.variants(policy, policy_input, noise_seed)
         cut = {knockout.selector for number in variants for knockout in self.conditions[number].keys}
         for name, selector in planned.groups.items():
             if selector not in cut:
                 self.run.say_once(f"The group '{name}' has no key at some replans: it is not measured there.")
-        actions_of, reference = self.run.actions_of(variants), actions
+        of_patches = {behind + place: variant for place, variant in patches.items()}
+        actions_of, reference = self.run.actions_of(variants | of_patches), actions
         if UNCHANGED in self.conditions:
             # Made as the changed calls are: in their batch, never compiled, with as many denoise steps.
             unchanged = self.conditions.index(UNCHANGED)
@@ -268,7 +284,10 @@ class EpisodeEffectsMeasured:
         }
         if UNCHANGED in self.conditions and unchanged in changes:  # how far it is from what the robot executed
             changes[unchanged] = ((reference - actions) / self.run.units).astype(np.float32)
+        of_patch = {number - behind: changes.pop(number) for number in [*changes] if number >= behind}
         measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
+        if measured == [self.conditions.index(UNCHANGED)] and len(changes) > 1:
+            of_patch = {}  # refused with the others
         weights = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
             if measured
@@ -282,11 +301,22 @@ class EpisodeEffectsMeasured:
         )
         self.run.seconds.append(time.perf_counter() - begun)
         if len(self.run.seconds) == 1 and self.run.says_seconds:
-            took = f"{plural(len(variants), 'changed call')} took {self.run.seconds[0]:.1f} s"
+            took = f"{plural(len(variants) + len(patches), 'changed call')} took {self.run.seconds[0]:.1f} s"
             self.run.say(f"Effects: {took} at the first policy call that is measured.")
         units = tuple(float(unit) for unit in self.run.units)
         silent = self.run.silent_blocks or ()
-        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent)
+        map_of = None if order is None else order.stored(policy, of_patch, len(actions))
+        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent, map_of)
+
+    def _order(
+        self, policy_input: PolicyInput, noise_seed: int, context: CallContext, horizon: int
+    ) -> PatchOrder | None:
+        policy, steps = self.run.policy, min(self.run.executed or self.run.policy.default_replan_steps, horizon)
+        seed = (self.run.planned.seed % 2**32, context.task_id, context.episode_index, context.replan)
+        order = patch_order(policy, policy_input, noise_seed, steps, horizon, seed)
+        if order is None:
+            self.run.say_once("The first order of the patches is NaN or infinite: no map is made of such calls.")
+        return order
 
     def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
         pictures = self.run.pictures

@@ -228,6 +228,29 @@ class UnitsPolicy(Protocol):
         """Return how far 1 of the model's normalised actions moves the robot, (action dim,), in the robot's units."""
 
 
+@runtime_checkable
+class MapPolicy(VariantPolicy, Protocol):
+    """A policy of whose calls it can be computed by first order how every patch moves the actions."""
+
+    def patch_gradients(
+        self, policy_input: PolicyInput, noise_seed: int, directions: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return what cutting each patch as a whole changes of sums of a call's actions, (direction, patch) float32.
+
+        directions: the factors of the actions (direction, horizon, action dim), normalised. Patches are those of the
+        first site, in the order of `map_keys`.
+        """
+
+    def gradient_memory(self) -> int:
+        """Return the bytes that `patch_gradients` takes beside the model, about."""
+
+
+def map_keys(policy: Policy) -> tuple[int, ...]:
+    """Return the keys of the patches of all cameras at the policy's first site."""
+    site = policy.sites[0]
+    return tuple(int(key) for camera in policy.cameras for key in site.patch_keys(camera.name))
+
+
 def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:
     """Return the bytes of every picture that is stored of a call; image_size: side of the cameras' own pictures."""
     sizes = [math.prod(picture_size(policy.sites, camera.name)) * 3 for camera in policy.cameras]

@@ -210,7 +210,10 @@ class Rerun:
         if not todo:
             return 0
         caller = self.unchanged if interventions.is_none else self._caller(interventions, allow_empty=allow_empty)
-        effects = measurement_of(self.recording.effects, self.policy, families_of(self.base), say, self.pictures)
+        executed = self.base.attributes.protocol.replan_steps
+        effects = measurement_of(
+            self.recording.effects, self.policy, families_of(self.base), say, self.pictures, executed
+        )
         if self.recording.effects is not None:
             say(describe_effects(self.recording.effects))
         caller = replace(caller, effects=effects)

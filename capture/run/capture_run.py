@@ -160,7 +160,7 @@ def _plan_calls(settings: RunSettings, policy: Policy, protocol: Protocol, tasks
     pictures = pictures_of(settings.recording.effects, policy, settings.suite.name)
     if note:
         say(note)
-    effects = measurement_of(recording.effects, policy, families, say, pictures)
+    effects = measurement_of(recording.effects, policy, families, say, pictures, protocol.replan_steps)
     return Caller(policy, recording, changes, effects, looks_at_words=True)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +19,13 @@ from vla_attention.capture.store.replan_records import (
     CHUNK_AXES,
     EpisodeStart,
     RecordedSteps,
+    ReplanMap,
     ReplanRecord,
 )
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.capture.store.unpublished import UnpublishedFolder
-from vla_attention.schemas.effects import EpisodeEffects
+from vla_attention.schemas.effects import EffectMap, EpisodeEffects
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt
@@ -34,6 +35,7 @@ from vla_attention.schemas.stores.content_rules import (
     Block,
     counter_problems,
     effect_shapes,
+    map_shapes,
     piece_role_problems,
     prompt_problems,
     shape_problems,
@@ -188,7 +190,10 @@ class EpisodeWriter:
         if effects is not None:
             before = (self.records[0].effects if self.records else None) or effects
             empty = np.zeros((0, 0, 0), dtype=np.float32)
-            effects = replace(effects, conditions=before.conditions, items=before.items, change=empty, cut={})
+            no_map = effects.map and replace(effects.map, sizes=empty.ravel(), change=empty)
+            effects = replace(
+                effects, conditions=before.conditions, items=before.items, change=empty, cut={}, map=no_map
+            )
         return replace(
             record, rows={}, key_role={}, state=None, actions=None, frames={}, camera_frames={}, coverage={},
             dataset_actions=None, base_actions=None, effects=effects,
@@ -218,6 +223,8 @@ class EpisodeWriter:
         if effects is not None:
             horizon = self.run.policy.action_horizon if record.actions is None else len(record.actions)
             shapes = effect_shapes(sites, len(effects.measured), horizon, len(effects.units))
+            if effects.map is not None:
+                shapes |= map_shapes(_map_of([(replan, effects.map)]), horizon, len(effects.units))
         yield from self._broken_rules({name: values for name, (values, _) in record.arrays.items()}, shapes)
         yield from self._misfits(record)
         steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
@@ -251,6 +258,8 @@ class EpisodeWriter:
         if wanted is not (effects is not None):
             yield f"it has {'no ' if wanted else ''}effects, other than the run says"
         earlier = first.effects  # a run that measures effects does so at the first replan
+        if effects and effects.map and planned and "map" not in planned.items:
+            yield "it has a map of patches, other than the run says"
         if effects and earlier and (effects.conditions, effects.units) != (earlier.conditions, earlier.units):
             yield "its effects are of other conditions, or in other units, than those of the replans before it"
 
@@ -318,6 +327,9 @@ class EpisodeWriter:
                 tuple(replan for replan, of in measured for _ in of.measured),
                 tuple(number for _, of in measured for number in of.measured),
                 measured[0][1].silent_blocks,
+                _map_of(maps)
+                if (maps := [(replan, of.map) for replan, of in measured if of.map is not None])
+                else None,
             ),
             steps=None if steps is None else steps.attributes,
             plumbing=next((record.plumbing for record in records if record.plumbing is not None), None),
@@ -363,6 +375,21 @@ class EpisodeWriter:
         """Read everything back from disk, with the checks of `vla-attention store verify`."""
         for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem.text}.")
+
+
+def _map_of(maps: Sequence[tuple[int, ReplanMap]]) -> EffectMap:
+    """What is said of the maps of some replans, which are of the same patches."""
+    first = maps[0][1]
+    return EffectMap(
+        first.site,
+        first.keys,
+        first.projections,
+        first.drawn,
+        first.steps,
+        tuple(replan for replan, _ in maps),
+        tuple(replan for replan, of in maps for _ in of.patches),
+        tuple(patch for _, of in maps for patch in of.patches),
+    )
 
 
 def _shapes_of_replan(record: ReplanRecord) -> dict[str, tuple[int, ...]]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.effects import CHANGE, CUT, EffectItem
+from vla_attention.schemas.effects import CHANGE, CUT, MAP, PATCH_CHANGE, EffectItem
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, EpisodeSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
@@ -51,13 +51,31 @@ class RecordedRows:
 
 
 @dataclass(frozen=True)
+class ReplanMap:
+    """Which patches move the actions of one replan, see `EffectMap`.
+
+    site, keys, projections, drawn, steps: of the episode. sizes: (patch,) float32 by first order. patches: those of
+    `change` (entry, horizon, action dim) float32, in the units of the effects.
+    """
+
+    site: str
+    keys: tuple[int, ...]
+    projections: int
+    drawn: int
+    steps: int
+    sizes: NDArray[np.float32]
+    patches: tuple[int, ...]
+    change: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class ReplanEffects:
     """The effects of one replan.
 
     conditions, items: of the episode, the same at all its replans. units: see `EpisodeEffects`. measured: the numbers
     of the conditions that were measured, ascending. change: (measured, horizon, action dim) float32, actions under the
     condition minus actions, in `units`. cut: site -> (measured, key) float32, the weights of the keys that were cut.
-    silent_blocks: see `EpisodeEffects`.
+    silent_blocks: see `EpisodeEffects`. map: None where none was made.
     """
 
     conditions: tuple[Interventions, ...]
@@ -67,6 +85,7 @@ class ReplanEffects:
     change: NDArray[np.float32]
     cut: Mapping[str, NDArray[np.float32]]
     silent_blocks: tuple[str, ...] = ()
+    map: ReplanMap | None = None
 
 
 @dataclass(frozen=True)
@@ -119,6 +138,9 @@ class ReplanRecord:
         if self.effects is not None and self.effects.measured:
             arrays[CHANGE] = (self.effects.change, ("entry", "horizon", "action_dim"))
             arrays |= {f"{site}/{CUT}": (cut, ("entry", "key")) for site, cut in self.effects.cut.items()}
+        if self.effects is not None and (map_of := self.effects.map) is not None:
+            arrays[MAP] = (map_of.sizes[None], ("map_row", "patch"))
+            arrays[PATCH_CHANGE] = (map_of.change, ("map_entry", "horizon", "action_dim"))
         return arrays
 
 

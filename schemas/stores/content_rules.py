@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from vla_attention.schemas.effects import CHANGE, CUT
+from vla_attention.schemas.effects import CHANGE, CUT, MAP, PATCH_CHANGE, EffectMap
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSE, POSES
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import (
@@ -338,6 +338,12 @@ def _cut_problems(block: Block) -> Iterator[str]:
     return block.faults("has the weight {:.4g}; expected 0 to 1,", outside, "entry", "key", found=block.values)
 
 
+def _map_problems(block: Block) -> Iterator[str]:
+    """Sizes by first order (map_row, patch): 0 or more."""
+    outside = ~((block.values >= 0) & np.isfinite(block.values))
+    return block.faults("has the size {:.4g}; expected 0 or more,", outside, "map_row", "patch", found=block.values)
+
+
 def _pose_problems(block: Block) -> Iterator[str]:
     """Poses (moment, body, 7): finite, and with quaternions of length 1."""
     yield from _finite("moment", "body")(block)
@@ -381,6 +387,11 @@ def effect_shapes(sites: Sequence[SiteLayout], entries: int, horizon: int, dims:
     return {CHANGE: (entries, horizon, dims)} | cuts
 
 
+def map_shapes(of: EffectMap, horizon: int, dims: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of a map of patches; `dims` is the number of dimensions of an action."""
+    return {MAP: (len(of.replan), len(of.keys)), PATCH_CHANGE: (len(of.patch), horizon, dims)}
+
+
 def shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> Iterator[str]:
     """Whether an array has another shape than it must have; a single length is that of the first axis."""
     # Axes of `uniform` but the last have length 1 where nothing changes along them.
@@ -402,6 +413,8 @@ _RULES: dict[str, tuple[DTypeLike | None, Callable[[Block], Iterator[str]]]] = {
     "SITE/contribution": (np.float32, _gram_problems),
     f"SITE/{CUT}": (np.float32, _cut_problems),
     CHANGE: (np.float32, _finite("entry")),
+    MAP: (np.float32, _map_problems),
+    PATCH_CHANGE: (np.float32, _finite("map_entry")),
     POSES: (np.float32, _pose_problems),
     GRIPPER: (np.float32, _finite("moment")),
     EXECUTED: (np.float32, _finite("step")),

@@ -19,6 +19,7 @@ from vla_attention.schemas.stores.content_rules import (
     Block,
     counter_problems,
     effect_shapes,
+    map_shapes,
     piece_role_problems,
     prompt_problems,
     shape_problems,
@@ -86,6 +87,8 @@ def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dic
         # The caller's own loop may give one action of a chunk.
         horizon = root.policy.action_horizon if actions is None else actions.shape[1]
         shapes |= effect_shapes(root.sites, len(attributes.effects.replan), horizon, len(attributes.effects.units))
+        if attributes.effects.map is not None:
+            shapes |= map_shapes(attributes.effects.map, horizon, len(attributes.effects.units))
     if attributes.steps is not None:
         moments = attributes.num_steps + 1
         shapes[POSES] = (moments, len(attributes.steps.bodies), POSE)

@@ -43,10 +43,19 @@ def call_bytes(config: PiConfig, num_bytes: int) -> int:
     brought into the order of the calls.
     """
     model, keys = config.paligemma, config.prefix_len
-    block = keys * (3 * model.mlp_dim + 8 * model.width) * num_bytes
-    logits = 2 * 4 * model.num_heads * keys**2
     caches = 2 * model.depth * 2 * keys * model.num_kv_heads * model.head_dim * num_bytes
-    return block + logits + caches
+    return _block_bytes(config, num_bytes) + caches
+
+
+def graph_bytes(config: PiConfig, num_bytes: int) -> int:
+    """Return the memory of the graph of a call, about: of every prefix block, and a seventh for the denoise steps."""
+    return round(8 / 7 * config.paligemma.depth * _block_bytes(config, num_bytes))
+
+
+def _block_bytes(config: PiConfig, num_bytes: int) -> int:
+    model, keys = config.paligemma, config.prefix_len
+    block = keys * (3 * model.mlp_dim + 8 * model.width) * num_bytes
+    return block + 2 * 4 * model.num_heads * keys**2
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,17 @@ from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.machine import memory_left_on
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.noise import initial_noise, noise_seed
-from vla_attention.capture.policies.pi.call_variants import ModelCall, call_bytes, most_calls, sample_variants
+from vla_attention.capture.policies.pi.call_variants import (
+    ModelCall,
+    call_bytes,
+    graph_bytes,
+    most_calls,
+    sample_variants,
+)
 from vla_attention.capture.policies.pi.compiled import CompiledSteps
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times
+from vla_attention.capture.policies.pi.influence import cut_gradients
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing, image_tensor
@@ -29,7 +36,14 @@ from vla_attention.capture.policies.pi.tokenizer import (
     check_vocabulary,
     clean_instruction,
 )
-from vla_attention.capture.policies.policy import CallVariant, GivenInputs, PolicyInput, VariantMemory, camera_frame
+from vla_attention.capture.policies.policy import (
+    CallVariant,
+    GivenInputs,
+    PolicyInput,
+    VariantMemory,
+    camera_frame,
+    map_keys,
+)
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
@@ -280,6 +294,21 @@ class PiPolicy:
             self.processing.environment_actions(actions, each.policy_input.state)
             for actions, each in zip(sampled, variants, strict=True)
         ]
+
+    def patch_gradients(
+        self, policy_input: PolicyInput, noise_seed: int, directions: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the first order of knock-outs; see `MapPolicy`."""
+        noise, model = self._noise([noise_seed]), self.model
+        sums = torch.zeros((len(directions), *noise.shape[1:]), device=model.device)
+        sums[..., : directions.shape[-1]] = torch.from_numpy(directions).to(model.device)
+        found = cut_gradients(model, policy_input.tensors, noise, sums, model.config.num_denoise_steps)
+        gradients: NDArray[np.float32] = found[:, list(map_keys(self))].cpu().numpy()
+        return gradients
+
+    def gradient_memory(self) -> int:
+        """Return the bytes that the graph of `patch_gradients` takes, about."""
+        return graph_bytes(self.model.config, self.model.action_in_proj.weight.element_size())
 
     def _noise(self, seeds: Sequence[int]) -> Tensor:
         """Return the noise (call, horizon, action dim) of calls, each from its seed."""

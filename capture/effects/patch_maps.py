@@ -1,0 +1,86 @@
+"""Which patches move the actions of a call: all of them by first order, the strongest by exact knock-outs.
+
+The two are kept apart (`EffectMap`): the first order is an order of the patches, and sizes are of exact knock-outs
+alone. Patches that are drawn at random are knocked out too: how the order of these agrees with their exact one says how
+far the map can be trusted. `benchmarks/effect_maps.py` measures both against the exact knock-outs of every patch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
+from vla_attention.capture.policies.policy import CallVariant, MapPolicy, Policy, PolicyInput, UnitsPolicy, map_keys
+from vla_attention.capture.store.replan_records import ReplanMap
+from vla_attention.schemas.layout import Role
+
+#: Directions of the first order, the part of the patches that are knocked out exactly, and how many at random.
+PROJECTIONS, STRONGEST, DRAWN = 8, 0.15, 10
+
+
+@dataclass(frozen=True)
+class PatchOrder:
+    """The first order of one call.
+
+    Attributes:
+        keys: of the patches.
+        sizes: (patch,) float32.
+        chosen: the places of the patches that are knocked out: the strongest, then those that were drawn.
+        steps: of the chunk that count.
+        drawn: how many were drawn.
+    """
+
+    keys: tuple[int, ...]
+    sizes: NDArray[np.float32]
+    chosen: tuple[int, ...]
+    steps: int
+    drawn: int
+
+    def variants(self, policy: Policy, policy_input: PolicyInput, noise_seed: int) -> dict[int, CallVariant]:
+        """The calls without each chosen patch, by its place."""
+        site, found = policy.sites[0], {}
+        for place in self.chosen:
+            factors = np.ones(site.num_keys)
+            factors[self.keys[place]] = 0.0
+            editor = SiteEditor(site.name, [SiteEdit(f"patch {place}", "factor", factors, "all")])
+            found[place] = CallVariant(policy_input, noise_seed, {site.name: editor})
+        return found
+
+    def stored(self, policy: Policy, changes: Mapping[int, NDArray[np.float32]], horizon: int) -> ReplanMap:
+        """What is stored, with the changes (horizon, action dim) of patches by their places."""
+        kept = [place for place in self.chosen if place in changes]
+        dims = next(iter(changes.values())).shape[1] if changes else 0
+        change = np.stack([changes[place] for place in kept]) if kept else np.zeros((0, horizon, dims), np.float32)
+        return ReplanMap(
+            policy.sites[0].name, self.keys, PROJECTIONS, self.drawn, self.steps, self.sizes, tuple(kept), change
+        )
+
+
+def patch_order(
+    policy: Policy, policy_input: PolicyInput, noise_seed: int, steps: int, horizon: int, seed: tuple[int, ...]
+) -> PatchOrder | None:
+    """Return the first order of a call; None where it is not finite.
+
+    steps: of the chunk of `horizon` actions that are executed. seed: of the directions, and of the patches that are
+    drawn.
+    """
+    generator, keys = np.random.default_rng(seed), map_keys(policy)
+    units, made_by = cast(UnitsPolicy, policy).action_units(), cast(MapPolicy, policy)
+    signs = np.zeros((PROJECTIONS, horizon, len(units)), np.float32)
+    moved = np.flatnonzero(units)
+    signs[:, :steps, moved] = generator.choice([-1.0, 1.0], (PROJECTIONS, steps, len(moved)))
+    gradients = made_by.patch_gradients(policy_input, noise_seed, signs / np.float32((steps * len(moved)) ** 0.5))
+    sizes = np.sqrt((gradients.astype(np.float64) ** 2).mean(axis=0)).astype(np.float32)
+    if not np.isfinite(sizes).all():
+        return None
+    seen = np.flatnonzero(policy_input.key_role[policy.sites[0].name][list(keys)] == Role.IMAGE)
+    by_size = seen[np.argsort(-sizes[seen], kind="stable")]
+    strongest = round(STRONGEST * len(seen))
+    drawn = generator.permutation(by_size[strongest:])[:DRAWN]
+    chosen = tuple(int(place) for place in (*by_size[:strongest], *drawn))
+    return PatchOrder(keys, sizes, chosen, steps, len(drawn))
