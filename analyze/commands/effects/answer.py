@@ -28,6 +28,7 @@ from vla_attention.analyze.commands.effects.items import (
     with_noise_row,
     with_untested,
 )
+from vla_attention.analyze.commands.effects.maps import of_maps
 from vla_attention.analyze.commands.effects.prompts import other_sentences
 from vla_attention.analyze.commands.effects.ways import unlike_attention, ways_of_words
 from vla_attention.analyze.core.about import about, enough, how_to_record_effects, notes, with_interval
@@ -110,17 +111,20 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
             [Table("effects_items", items, [*looks, *columns_of_items(items, units)]), *of_prompts, *files],
             [],
         )
+    of_patches, maps = of_maps(question, units)
+    if of_patches and items.is_empty():
+        return of_patches, [*maps, *files], []
     items = with_exchanges(question, episodes, with_untested(question, items))
     of_words = pl.col("item_kind").is_in(["word", "exchange"])
     words, others = items.filter(IS_WORD), items.filter(~of_words)
     findings = [*exchanged(question, episodes, units), *otherwise, deciding(words, units, summary)]
     findings += [*_sides(question, episodes, units), *_others(others), *ways_of_words(question, episodes, words)]
-    findings += unlike_attention(words)
+    findings += [*unlike_attention(words), *of_patches]
     course, shown = _over_time(found, items), with_noise_row(items, summary)
     columns = columns_of_items(shown, units)
     tables = [Table("effects_items", shown, columns, "Without it, the action changes by", rows=16), *files]
     figures = figures_of_items(items, course, summary, units)
-    return findings, [*of_prompts, *tables, Table("effects_time", course)], figures
+    return findings, [*of_prompts, *tables, *maps, Table("effects_time", course)], figures
 
 
 def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> Finding:
