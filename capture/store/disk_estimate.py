@@ -114,6 +114,7 @@ def _most_inodes(recording: Recording, sites: Sequence[SiteLayout], pictures: in
     cameras = sum(span.grid is not None for site in sites for span in site.spans)
     # Of a site: rows, atoms, roles, uniform attention. Once: actions and state, three arrays of the steps.
     arrays = len(sites) * (4 + recording.contributions + effects) + 2 + 3 + frames + cameras + effects
+    arrays += 2 if recording.effects is not None and "map" in recording.effects.items else 0
     # The episode, its seal and steps, its sites; pictures twice, objects, effects.
     groups = 3 + len(sites) + (2 if frames else 0) + (1 if cameras else 0) + effects
     return 3 * arrays + 2 * groups
@@ -125,10 +126,14 @@ def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[Si
     tokens = sum(span.num_keys for site in sites for span in site.spans if span.kind == "text")
     # Each group is cut off, kept alone, and has a control.
     counts = {"cameras": 2 + 2 * cameras, "tokens": tokens, "groups": 3 * len(effects.groups)}
-    counts["prompts"] = effects.most_prompts
+    counts |= {"prompts": effects.most_prompts, "map": 0}
     entries = len(effects.readers) * sum(counts.get(item, _MOST_ITEMS) for item in effects.items) + _MOST_ITEMS
-    of_entry = 4 * horizon * _ACTION_DIMENSIONS * _INCOMPRESSIBLE + sum(site.num_keys for site in sites) / 8
-    return entries * of_entry / effects.every
+    change = 4 * horizon * _ACTION_DIMENSIONS * _INCOMPRESSIBLE
+    total = entries * (change + sum(site.num_keys for site in sites) / 8)
+    if "map" in effects.items:  # a number a patch, and the exact changes of up to a fifth of them
+        patches = sum(span.num_keys for span in sites[0].spans if span.grid is not None)
+        total += 4 * patches * _INCOMPRESSIBLE + (patches / 5 + _MOST_ITEMS) * change
+    return total / effects.every
 
 
 def describe(estimate: DiskEstimate, path: Path) -> str:

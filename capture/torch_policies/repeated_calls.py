@@ -74,6 +74,8 @@ def effects_of_layout(effects: str | EffectSettings | None, layout: PolicyLayout
             f"Cannot measure effects with {settings.denoise_steps} denoise steps: a call of your own is repeated as it "
             "is. Leave denoise_steps out."
         )
+    if "map" in settings.items:
+        raise BadArgument("Cannot measure a map of patches of a call of your own, which has no backward pass here.")
     tokens = [rule for rule in layout.rules if rule.tokens is not None]
     for reader in settings.readers:
         if reader == "action" or any(rule.is_prefix or reader == "all" for rule in tokens):

@@ -31,7 +31,7 @@ from vla_attention.capture.store.replan_records import (
     ReplanRecord,
 )
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
-from vla_attention.schemas.effects import EffectItem, EffectsRecorded
+from vla_attention.schemas.effects import EffectItem, EffectItems, EffectsRecorded
 from vla_attention.schemas.episode_steps import HAND, EpisodeSteps, TaskGoal
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -113,6 +113,7 @@ class StoreSpec:
     plant_actions: PlantActions | None = None
     plant_success: PlantSuccess | None = None
     plant_effects: PlantEffects | None = None
+    effect_items: tuple[EffectItems, ...] = ("text",)
     plant_steps: PlantSteps | None = None
 
     @property
@@ -254,7 +255,7 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
             contributions=spec.contributions,
             effects=None
             if spec.plant_effects is None
-            else EffectsRecorded(("text",), ("all", "action"), every=1, denoise_steps=1, seed=1),
+            else EffectsRecorded(spec.effect_items, ("all", "action"), every=1, denoise_steps=1, seed=1),
         ),
         sites=(spec.layout,),
         provenance={"numpy": np.__version__},

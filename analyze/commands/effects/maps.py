@@ -56,8 +56,8 @@ def _finding(question: Question, summary: pl.DataFrame) -> Finding:
 
     said = (
         f"Take away one patch at a time: of what the strongest tenth of the patches do to the action, {part('named')} "
-        f"lies on what the sentence names, {part('robot')} on the robot, {part('other')} on neither. What is named covers "
-        f"{100 * row['area_named']:.1f}% of the pictures, the robot {100 * row['area_robot']:.0f}%."
+        f"lies on what the sentence names, {part('robot')} on the robot, {part('other')} on neither. What is named "
+        f"covers {100 * row['area_named']:.1f}% of the pictures, the robot {100 * row['area_robot']:.0f}%."
     )
     if row["rank"] is not None:
         low = row["rank_low"] if row["rank_low"] is not None else row["rank"]
