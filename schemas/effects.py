@@ -114,7 +114,8 @@ class EffectMap(Document, frozen=True):
     how far the first `steps` actions change without each patch, root mean square of the normalised actions. It is an
     order; sizes are those of `effects/patch_change`, whose entry i is the exact change without patch `patch[i]` at
     replan `patch_replan[i]`, in the units of the episode's effects. Of each replan these are its strongest patches by
-    first order, and behind them `drawn` others that were drawn at random, which say how far the order can be trusted.
+    first order, and some of the others that were drawn at random (`drawn[i]`), which say how far the order can be
+    trusted.
 
     keys: of the patches, at the site `site`, cameras in the order of its keys.
     """
@@ -122,15 +123,17 @@ class EffectMap(Document, frozen=True):
     site: str
     keys: tuple[int, ...]
     projections: int
-    drawn: int
     steps: int
     replan: tuple[int, ...]
     patch_replan: tuple[int, ...]
     patch: tuple[int, ...]
+    drawn: tuple[bool, ...]
 
     def __post_init__(self) -> None:
         """Check that entries are of replans and patches of the map."""
-        if len(self.patch) != len(self.patch_replan) or not set(self.patch_replan) <= set(self.replan):
+        if not len(self.patch) == len(self.patch_replan) == len(self.drawn) or not set(self.patch_replan) <= set(
+            self.replan
+        ):
             raise BadArgument("Exact changes of a map are of other replans than its rows.")
         if any(not 0 <= one < len(self.keys) for one in self.patch):
             raise BadArgument(f"Exact changes of a map are of patches beyond its {len(self.keys)}.")

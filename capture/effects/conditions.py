@@ -59,6 +59,8 @@ def check_effects(planned: EffectsRecorded, policy: Policy) -> None:
         raise BadArgument(
             f"Cannot use --effects map with {policy.family}: its calls have no backward pass here; leave out map."
         )
+    if "map" in planned.items and planned.denoise_steps < policy.num_denoise_steps:
+        raise BadArgument("Cannot use --effects-steps with --effects map: its order is of all denoise steps.")
     for reader in planned.readers:
         if _READERS[reader][0] == "prefix" and not policy.has_prefix:
             raise BadArgument(
@@ -93,13 +95,13 @@ def effects_recorded(
 
 def describe_effects(planned: EffectsRecorded) -> str:
     """Return the line that is printed before a run."""
-    named = {"map": "every patch by first order, the strongest exactly"}
-    named |= {"groups": plural(len(planned.groups), "group"), "prompts": plural(planned.most_prompts, "other prompt")}
-    items = [named.get(item, item) for item in planned.items]
+    named = {"groups": plural(len(planned.groups), "group"), "prompts": plural(planned.most_prompts, "other prompt")}
+    items = [named.get(item, item) for item in planned.items if item != "map"]
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)
     often = "every replan" if planned.every == 1 else f"one replan in {planned.every}"
-    return f"Effects of {listing(items)}, {by}, at {often} (docs/effects.md)."
+    parts = [f"{listing(items)}, {by}"] * bool(items) + ["patches, for all queries"] * ("map" in planned.items)
+    return f"Effects of {'; of '.join(parts)}; at {often} (docs/effects.md)."
 
 
 def refuse_both(interventions: Interventions) -> None:

@@ -97,7 +97,7 @@ class EffectMeasurement:
             memory = format_bytes(cast(MapPolicy, self.policy).gradient_memory())
             self.say(
                 f"Map: {PROJECTIONS} backward passes a policy call, which take about {memory} of memory, and exact "
-                f"calls without {STRONGEST:.0%} of the patches and {DRAWN} others."
+                f"calls without the strongest {STRONGEST:.0%} of the patches and {DRAWN} of the others."
             )
 
     def begin(self) -> EpisodeEffectsMeasured:
@@ -285,9 +285,7 @@ class EpisodeEffectsMeasured:
         if UNCHANGED in self.conditions and unchanged in changes:  # how far it is from what the robot executed
             changes[unchanged] = ((reference - actions) / self.run.units).astype(np.float32)
         of_patch = {number - behind: changes.pop(number) for number in [*changes] if number >= behind}
-        measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
-        if measured == [self.conditions.index(UNCHANGED)] and len(changes) > 1:
-            of_patch = {}  # refused with the others
+        measured, refused = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
         weights = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
             if measured
@@ -301,11 +299,13 @@ class EpisodeEffectsMeasured:
         )
         self.run.seconds.append(time.perf_counter() - begun)
         if len(self.run.seconds) == 1 and self.run.says_seconds:
-            took = f"{plural(len(variants) + len(patches), 'changed call')} took {self.run.seconds[0]:.1f} s"
+            calls = plural(len(variants) + len(patches), "changed call")
+            passes = "" if order is None else f" and {PROJECTIONS} backward passes"
+            took = f"{calls}{passes} took {self.run.seconds[0]:.1f} s"
             self.run.say(f"Effects: {took} at the first policy call that is measured.")
         units = tuple(float(unit) for unit in self.run.units)
         silent = self.run.silent_blocks or ()
-        map_of = None if order is None else order.stored(policy, of_patch, len(actions))
+        map_of = None if order is None else order.stored(policy, {} if refused else of_patch, actions.shape)
         return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent, map_of)
 
     def _order(
@@ -313,7 +313,12 @@ class EpisodeEffectsMeasured:
     ) -> PatchOrder | None:
         policy, steps = self.run.policy, min(self.run.executed or self.run.policy.default_replan_steps, horizon)
         seed = (self.run.planned.seed % 2**32, context.task_id, context.episode_index, context.replan)
-        order = patch_order(policy, policy_input, noise_seed, steps, horizon, seed)
+        try:
+            order = patch_order(policy, policy_input, noise_seed, steps, horizon, seed)
+        except torch.OutOfMemoryError:
+            torch.cuda.empty_cache()
+            self.run.say_once("The memory does not suffice for the backward passes of a call: no map is made.")
+            return None
         if order is None:
             self.run.say_once("The first order of the patches is NaN or infinite: no map is made of such calls.")
         return order
@@ -376,8 +381,8 @@ class EpisodeEffectsMeasured:
 
     def _refused_if_unlike(
         self, changes: Mapping[int, NDArray[np.float32]], context: CallContext, allowed: float
-    ) -> list[int]:
-        """Return the numbers of the conditions whose changes are kept, ascending."""
+    ) -> tuple[list[int], bool]:
+        """Return the numbers of the conditions that are kept, ascending, and whether the others are refused."""
         assert self.conditions is not None
         finite = [number for number, change in changes.items() if np.isfinite(change).all()]
         if len(finite) < len(changes):
@@ -385,10 +390,10 @@ class EpisodeEffectsMeasured:
             self.run.say_once(f"The actions are NaN or infinite under {names}: left out.")
         unchanged = next((number for number in finite if self.conditions[number] == UNCHANGED), None)
         if unchanged is None or not self.run.is_float32:
-            return finite
+            return finite, False
         difference = float(np.abs(changes[unchanged]).max(initial=0.0))
         if difference <= allowed:
-            return finite
+            return finite, False
         if not self.run.refused:
             self.run.say(
                 f"The effects of replan {context.replan} of {episode_name(context.task_id, context.episode_index)} are "
@@ -396,7 +401,7 @@ class EpisodeEffectsMeasured:
                 f"actions, allowed is {allowed:g}. Of further ones the store alone says so."
             )
         self.run.refused += 1
-        return [unchanged]
+        return [unchanged], True
 
 
 def _end_is_cut(prompt: Prompt) -> bool:

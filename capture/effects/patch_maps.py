@@ -1,7 +1,7 @@
 """Which patches move the actions of a call: all of them by first order, the strongest by exact knock-outs.
 
 The two are kept apart (`EffectMap`): the first order is an order of the patches, and sizes are of exact knock-outs
-alone. Patches that are drawn at random are knocked out too: how the order of these agrees with their exact one says how
+alone. Some of the others, drawn at random, are knocked out too: how their order agrees with their exact one says how
 far the map can be trusted. `benchmarks/effect_maps.py` measures both against the exact knock-outs of every patch.
 """
 
@@ -30,16 +30,14 @@ class PatchOrder:
     Attributes:
         keys: of the patches.
         sizes: (patch,) float32.
-        chosen: the places of the patches that are knocked out: the strongest, then those that were drawn.
+        chosen: the places of the patches that are knocked out, and whether each was drawn at random.
         steps: of the chunk that count.
-        drawn: how many were drawn.
     """
 
     keys: tuple[int, ...]
     sizes: NDArray[np.float32]
-    chosen: tuple[int, ...]
+    chosen: Mapping[int, bool]
     steps: int
-    drawn: int
 
     def variants(self, policy: Policy, policy_input: PolicyInput, noise_seed: int) -> dict[int, CallVariant]:
         """The calls without each chosen patch, by its place."""
@@ -51,14 +49,16 @@ class PatchOrder:
             found[place] = CallVariant(policy_input, noise_seed, {site.name: editor})
         return found
 
-    def stored(self, policy: Policy, changes: Mapping[int, NDArray[np.float32]], horizon: int) -> ReplanMap:
-        """What is stored, with the changes (horizon, action dim) of patches by their places."""
-        kept = [place for place in self.chosen if place in changes]
-        dims = next(iter(changes.values())).shape[1] if changes else 0
-        change = np.stack([changes[place] for place in kept]) if kept else np.zeros((0, horizon, dims), np.float32)
-        return ReplanMap(
-            policy.sites[0].name, self.keys, PROJECTIONS, self.drawn, self.steps, self.sizes, tuple(kept), change
-        )
+    def stored(self, policy: Policy, changes: Mapping[int, NDArray[np.float32]], shape: tuple[int, ...]) -> ReplanMap:
+        """What is stored, with the changes of patches by their places, each of a shape (horizon, action dim).
+
+        Those that are not finite are left out.
+        """
+        kept = [place for place in self.chosen if place in changes and np.isfinite(changes[place]).all()]
+        change = np.stack([changes[place] for place in kept]) if kept else np.zeros((0, *shape), np.float32)
+        drawn = tuple(self.chosen[place] for place in kept)
+        site = policy.sites[0].name
+        return ReplanMap(site, self.keys, PROJECTIONS, self.steps, self.sizes, tuple(kept), drawn, change)
 
 
 def patch_order(
@@ -81,6 +81,6 @@ def patch_order(
     seen = np.flatnonzero(policy_input.key_role[policy.sites[0].name][list(keys)] == Role.IMAGE)
     by_size = seen[np.argsort(-sizes[seen], kind="stable")]
     strongest = round(STRONGEST * len(seen))
-    drawn = generator.permutation(by_size[strongest:])[:DRAWN]
-    chosen = tuple(int(place) for place in (*by_size[:strongest], *drawn))
-    return PatchOrder(keys, sizes, chosen, steps, len(drawn))
+    chosen = {int(place): False for place in by_size[:strongest]}
+    chosen |= {int(place): True for place in generator.permutation(by_size[strongest:])[:DRAWN]}
+    return PatchOrder(keys, sizes, chosen, steps)

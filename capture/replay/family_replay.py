@@ -142,7 +142,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
         say(f"Black and masked: {listing(masked)}.")
     # A data set knows no families of tasks, so there are no words to exchange.
     pictures = pictures_of(settings.effects, policy, attributes.protocol.suite)
-    effects = measurement_of(recording.effects, policy, [], say, pictures, every)
+    effects = measurement_of(recording.effects, policy, [], say, pictures, policy.action_horizon)
     caller = Caller(policy, recording, effects=effects, looks_at_words=True)
     source = Frames(policy, caller, plan, every, attributes.provenance)
     return record_episodes(plan, store, todo, every, source)

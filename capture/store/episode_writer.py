@@ -384,11 +384,11 @@ def _map_of(maps: Sequence[tuple[int, ReplanMap]]) -> EffectMap:
         first.site,
         first.keys,
         first.projections,
-        first.drawn,
         first.steps,
         tuple(replan for replan, _ in maps),
         tuple(replan for replan, of in maps for _ in of.patches),
         tuple(patch for _, of in maps for patch in of.patches),
+        tuple(drawn for _, of in maps for drawn in of.drawn),
     )
 
 

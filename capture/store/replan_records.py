@@ -54,17 +54,17 @@ class RecordedRows:
 class ReplanMap:
     """Which patches move the actions of one replan, see `EffectMap`.
 
-    site, keys, projections, drawn, steps: of the episode. sizes: (patch,) float32 by first order. patches: those of
-    `change` (entry, horizon, action dim) float32, in the units of the effects.
+    site, keys, projections, steps: of the episode. sizes: (patch,) float32 by first order. patches: those of `change`
+    (entry, horizon, action dim) float32, in the units of the effects. drawn: which of them were drawn at random.
     """
 
     site: str
     keys: tuple[int, ...]
     projections: int
-    drawn: int
     steps: int
     sizes: NDArray[np.float32]
     patches: tuple[int, ...]
+    drawn: tuple[bool, ...]
     change: NDArray[np.float32]
 
 

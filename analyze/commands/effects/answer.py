@@ -106,6 +106,8 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
     otherwise, of_prompts = other_sentences(question, episodes, units, looks)
     if by:
         said = f"Below, a row for each item and {' and '.join(by)}."
+        if any(item.episode.attributes.effects.map for item in question.selected if item.episode.attributes.effects):
+            said += " Maps of patches are not divided: ask without --by."
         return (
             [Finding(said, "What does the action depend on?")],
             [Table("effects_items", items, [*looks, *columns_of_items(items, units)]), *of_prompts, *files],
@@ -113,7 +115,7 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
         )
     of_patches, maps = of_maps(question, units)
     if of_patches and items.is_empty():
-        return of_patches, [*maps, *files], []
+        return of_patches, [*maps, Table("effects_items", items), *files], []
     items = with_exchanges(question, episodes, with_untested(question, items))
     of_words = pl.col("item_kind").is_in(["word", "exchange"])
     words, others = items.filter(IS_WORD), items.filter(~of_words)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import polars as pl
 
 from vla_attention.analyze.core.about import enough
@@ -34,38 +37,40 @@ def of_maps(question: Question, units: ActionUnits) -> tuple[list[Finding], list
         Table("maps_summary", summary),
         Table("maps", patches),
     ]
-    return [_finding(question, summary)], tables
-
-
-def _finding(question: Question, summary: pl.DataFrame) -> Finding:
     row = summary.row(0, named=True)
-    limits = [
-        "One patch at a time: what several of them say, none of them moves.",
-        enough(question),
-    ]
     numbers = {name: row[name] for name in ("named", "robot", "other", "rank", "rank_low")}
+    limits = [_order(row), "One patch at a time: what several of them say, none of them moves.", enough(question)]
+    return [Finding(_said(row, patches, units), _ASKS, numbers, " ".join(filter(None, limits)))], tables
+
+
+def _said(row: Mapping[str, Any], patches: pl.DataFrame, units: ActionUnits) -> str:
+    does = "move the hand" if units.centimetres is not None else "change the action"
     if row["named"] is None:
-        said = "Not known which patches lie on what the sentence names: the store has no coverage of objects."
-        return Finding(said, _ASKS, numbers, " ".join(limits))
+        if patches["named"].null_count():
+            return (
+                "Not known of every patch whether it shows what the sentence names: no coverage of objects, or no goal."
+            )
+        return f"No single patch is found to {does}."
 
     def part(name: str) -> str:
-        ends = (
-            "" if row[f"{name}_low"] is None else f" [{100 * row[f'{name}_low']:.0f}, {100 * row[f'{name}_high']:.0f}]"
-        )
-        return f"{100 * row[name]:.0f}%{ends}"
+        low, high = row[f"{name}_low"], row[f"{name}_high"]
+        return f"{100 * row[name]:.0f}%" + ("" if low is None else f" [{100 * low:.0f}, {100 * high:.0f}]")
 
-    said = (
-        f"Take away one patch at a time: of what the strongest tenth of the patches do to the action, {part('named')} "
-        f"lies on what the sentence names, {part('robot')} on the robot, {part('other')} on neither. What is named "
-        f"covers {100 * row['area_named']:.1f}% of the pictures, the robot {100 * row['area_robot']:.0f}%."
+    return (
+        f"Take away one patch at a time: of how far the strongest tenth of the patches {does}, {part('named')} lies on "
+        f"what the sentence names, {part('robot')} on the robot, {part('other')} on neither. What is named covers "
+        f"{100 * row['area_named']:.1f}% of the pictures, the robot {100 * row['area_robot']:.0f}%."
     )
-    if row["rank"] is not None:
-        low = row["rank_low"] if row["rank_low"] is not None else row["rank"]
-        trust = "holds" if low >= TRUSTED else "does not hold"
-        ends = "" if row["rank_low"] is None else f" [{row['rank_low']:.2f}, {row['rank_high']:.2f}]"
-        limits.insert(
-            0,
-            f"The order of the map {trust} for patches that were drawn at random: rank correlation with their exact "
-            f"change {row['rank']:.2f}{ends}.",
-        )
-    return Finding(said, _ASKS, numbers, " ".join(filter(None, limits)))
+
+
+def _order(row: Mapping[str, Any]) -> str:
+    """How far the order of all patches can be trusted."""
+    if row["rank"] is None:
+        return "The order of all patches could not be tested: exact changes of others than the strongest are rounding."
+    size, ends = f"{row['rank']:.2f}", ""
+    if row["rank_low"] is None:
+        trust = "There are too few episodes to say whether the order of all patches holds"
+    else:
+        ends = f" [{row['rank_low']:.2f}, {row['rank_high']:.2f}]"
+        trust = f"The order of all patches is {'' if row['rank_low'] >= TRUSTED else 'not '}shown to hold"
+    return f"{trust}: rank correlation with exact changes, of patches drawn at random, {size}{ends}."

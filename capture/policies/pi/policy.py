@@ -308,7 +308,7 @@ class PiPolicy:
 
     def gradient_memory(self) -> int:
         """Return the bytes that the graph of `patch_gradients` takes, about."""
-        return graph_bytes(self.model.config, self.model.action_in_proj.weight.element_size())
+        return graph_bytes(self.model.config, self.model.dtype.itemsize)
 
     def _noise(self, seeds: Sequence[int]) -> Tensor:
         """Return the noise (call, horizon, action dim) of calls, each from its seed."""
@@ -319,7 +319,7 @@ class PiPolicy:
     def variant_memory(self) -> VariantMemory:
         """Return how much memory variants take, and how much is left for them."""
         config, device = self.model.config, self.model.device
-        number = self.model.action_in_proj.weight.element_size()
+        number = self.model.dtype.itemsize
         return VariantMemory(
             call_bytes(config, number),
             most_calls(config, config.prefix_len, device),

@@ -30,7 +30,8 @@ def planted_map(task: int, episode: int, replan: int, tokens: EpisodeTokens, agr
     chosen = [*order[:number], *generator.permutation(order[number:])[:DRAWN]]
     change = np.stack([sizes[place] * np.ones((5, 7)) for place in chosen]).astype(np.float32)
     of = planted_effects()(task, episode, replan, tokens)
-    one = ReplanMap("joint", keys, 8, DRAWN, 5, first.astype(np.float32), tuple(map(int, chosen)), change)
+    drawn = tuple(at >= number for at in range(len(chosen)))
+    one = ReplanMap("joint", keys, 8, 5, first.astype(np.float32), tuple(map(int, chosen)), drawn, change)
     return replace(of, map=one)
 
 
@@ -56,7 +57,7 @@ def test_parts_of_the_strongest_tenth_are_sums_over_its_patches(store):
         cover = np.concatenate([opened.read(f"objects/{camera}") for camera in sorted_cameras(opened)], axis=1)
         parts = []
         for number, replan in enumerate(one.replan):
-            entries = [i for i, at in enumerate(one.patch_replan) if at == replan][:-DRAWN]
+            entries = [i for i, at in enumerate(one.patch_replan) if at == replan and not one.drawn[i]]
             sizes = {one.patch[i]: abs(change[i]).mean() for i in entries}
             top = sorted(sizes, key=lambda patch: -sizes[patch])[: round(0.1 * len(one.keys))]
             whole = sum(sizes[patch] for patch in top)
@@ -88,7 +89,14 @@ def test_an_order_that_chance_could_give_is_said_not_to_hold(tmp_path):
     _, findings = tables_of(write_store(tmp_path / "a.zarr", spec=spec))
     (finding,) = [one for one in findings if one.asks == "What in the picture moves the action?"]
     assert finding.numbers["rank_low"] < 0.5
-    assert "does not hold" in finding.limit
+    assert "not shown to hold" in finding.limit
+
+
+def test_one_episode_does_not_say_that_the_order_holds(tmp_path):
+    spec = StoreSpec(tasks=(0,), episodes=1, replans=3, plant_effects=planted_map, effect_items=("text", "map"))
+    _, findings = tables_of(write_store(tmp_path / "a.zarr", spec=spec))
+    (finding,) = [one for one in findings if one.asks == "What in the picture moves the action?"]
+    assert "too few episodes" in finding.limit
 
 
 def test_stores_without_a_map_say_nothing_of_it(tmp_path):

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import zarr
 
+from tests.capture.effects.test_measurement import call_of, measurement
 from tests.capture.effects.test_recorded_effects import damaged
+from tests.capture.interventions.test_interventions_on_policies import policy_named
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
 from vla_attention.capture.__main__ import main
@@ -45,8 +48,9 @@ def test_the_strongest_patches_and_others_are_knocked_out(mapped):
         assert list(one.keys) == [key for camera in cameras for key in layout.patch_keys(camera)]
         assert list(one.replan) == list(range(episode.attributes.num_replans)) == list(range(len(sizes)))
         entries, number = np.array(one.patch).reshape(len(sizes), -1), round(STRONGEST * len(one.keys))
-        assert entries.shape[1] == number + one.drawn
-        assert one.drawn == min(DRAWN, len(one.keys) - number)
+        drawn = np.array(one.drawn).reshape(entries.shape)
+        assert entries.shape[1] == number + min(DRAWN, len(one.keys) - number)
+        assert (drawn == (np.arange(entries.shape[1]) >= number)).all()
         for row, patches in zip(sizes, entries, strict=True):
             assert set(patches[:number]) == set(np.argsort(-row)[:number])
             assert len(set(patches)) == len(patches)
@@ -68,6 +72,34 @@ def test_a_change_without_a_patch_is_that_of_a_rerun(mapped, tmp_path):
         assert np.abs(expected).max() > 1e-4
 
 
+@pytest.mark.parametrize("kind", ["refused", "not finite", "without memory"])
+def test_calls_whose_changes_cannot_be_used_have_an_order_alone(kind, monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    run = measurement(policy, items=("map",))
+    make = type(policy).act_variants
+
+    def spoiled(self, variants, num_steps, batch):
+        if kind == "without memory":
+            raise torch.OutOfMemoryError
+        made = list(make(self, variants, num_steps, batch))
+        for i, one in enumerate(made):
+            if (kind == "refused" and i == 0) or (kind == "not finite" and i > 1):
+                made[i] = one + (1.0 if kind == "refused" else np.nan)
+        return made
+
+    monkeypatch.setattr(type(policy), "act_variants", spoiled)
+    effects = run.begin().measure(given, 11, actions, context)
+    assert effects.map.patches == effects.map.drawn == ()
+    assert effects.map.change.shape == (0, *actions.shape)
+    assert (effects.map.sizes > 0).any()
+
+
+def test_fewer_denoise_steps_have_no_map():
+    with pytest.raises(BadArgument, match="--effects-steps"):
+        measurement(policy_named("pi05"), items=("map",), denoise_steps=1)
+
+
 def test_policies_without_a_backward_pass_have_none(tmp_path, capsys):
     with pytest.raises(AssertionError):
         capture(tmp_path / "cosmos.zarr", "cosmos", "--effects", "map")
@@ -80,6 +112,7 @@ def test_verify_finds_maps_that_do_not_fit(mapped, tmp_path):
     for name, edit in {
         "keys": lambda of: of["keys"].pop(),
         "patch": lambda of: of["patch"].append(0),
+        "drawn": lambda of: of["drawn"].pop(),
         "replan": lambda of: of["replan"].pop(),
     }.items():
         copy = tmp_path / name

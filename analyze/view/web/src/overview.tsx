@@ -128,7 +128,7 @@ function Card({ line }: { line: EpisodeLine }) {
           </span>
         ) : numbers?.ratio != null ? (
           <span class="soft ratio-of" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>
-            ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)
+            {shown(numbers.ratio)} ({shown(numbers.lift)} × even)
           </span>
         ) : null}
       </span>
