@@ -231,7 +231,7 @@ def test_the_overview_finds_episodes(view, server, store):
     ratios = va.open(store).analyze()["episodes"].filter(layer="layers_avg").sort("task_id", "episode_index")
     view.page.go_back()
     view.page.wait_for_selector(".card .soft")
-    shown = [float(text.split(" ")[1]) for text in view.page.locator(".card .soft").all_inner_texts()]
+    shown = [float(text.split(" ")[0]) for text in view.page.locator(".card .soft").all_inner_texts()]
     assert shown == [float(f"{ratio:.3g}") for ratio in ratios["geometric_mean"]]
 
 
