@@ -212,6 +212,9 @@ def test_from_the_grid_to_a_head_over_all_episodes_and_back_to_a_call(view, serv
     view.page.get_by_text("all heads of layer 2").click()
     view.page.wait_for_selector(".layer-maps .stack img")
     assert view.page.locator(".layer-maps > button[aria-pressed=true]").inner_text().strip() == "head 1"
+    for gone in ("episode=", "of=head"):  # back to the head, then to the list
+        view.page.locator("body").press("Escape")
+        view.page.wait_for_url(lambda link, gone=gone: gone not in link, wait_until="commit")
 
 
 def test_the_overview_finds_episodes(view, server, store):

@@ -65,8 +65,8 @@ function next(known: readonly number[] | undefined, now: number | "mean", by: nu
 
 addEventListener("keydown", (event) => {
   const on = event.target as HTMLElement;
-  if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea") || !episodeName.value)
-    return;
+  if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea")) return;
+  if (!episodeName.value && !(part("of") && event.key === "Escape")) return; // a head's page is left, too
   const acts: Record<string, () => void> = {
     ArrowLeft: () => walk(-1),
     ArrowRight: () => walk(1),
