@@ -257,8 +257,7 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
     shown = np.ones(mean.shape[1]) if tokens.border is None else 1.0 - tokens.border
     image = mean * shown * (tokens.static_roles == int(Role.IMAGE))
     uniform = mean_of_layers(uniform_keys(item, selection).mean(axis=(2, 3)), selection)
-    # As much mass as the valid keys have, shared out as uniform attention does.
-    uniform = uniform * ((mean * item.valid).sum(axis=1) / (uniform * item.valid).sum(axis=1))[:, None]
+    uniform = shared_out(mean, uniform, item.valid)
     whole = image.sum(axis=1)
     maps = {}
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -276,6 +275,12 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
             for replan, prompt in enumerate(tokens.prompt_index)
         ] if tokens.prompt_index is not None and tokens.words else []  # fmt: skip
     return EpisodeMaps(item, item.episode.read("env_step").astype(np.int64), maps, whole, words)
+
+
+def shared_out(mass: Array, uniform: Array, valid: NDArray[np.bool_]) -> Array:
+    """As much mass (..., key) as the valid keys have, shared out as uniform attention does."""
+    shares: Array = uniform * ((mass * valid).sum(axis=-1) / (uniform * valid).sum(axis=-1))[..., None]
+    return shares
 
 
 def scale_end(values: NDArray[np.floating]) -> float:

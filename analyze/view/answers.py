@@ -25,6 +25,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import product
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from vla_attention.analyze.core.action_changes import ActionUnits, units_of
@@ -44,6 +45,10 @@ Content: TypeAlias = tuple[bytes, str]
 _OPEN = 8
 
 
+class StoreGone(UserError):
+    """A store that the page shows is not there any more."""
+
+
 class Answers:
     """The answers about some stores; asked by several threads at once."""
 
@@ -60,6 +65,7 @@ class Answers:
 
         Raises:
             NothingThere: nothing has this address.
+            StoreGone: the store was moved or deleted.
             UserError: what it names does not exist, or cannot be read.
         """
         if list(names) == [RUNS]:
@@ -69,6 +75,7 @@ class Answers:
             served = stores[int(number)]
         except (ValueError, IndexError):
             raise NothingThere from None
+        _check_there(served.store)
         if [episode, *rest] == ["numbers.json"]:
             return _json(served.summary.document())
         if [episode, *rest] == ["heads.json"]:
@@ -187,7 +194,7 @@ def _heads_of_run(store: Store, query: Mapping[str, Sequence[str]]) -> dict[str,
     given = {name: values[0] for name, values in query.items()}
     if given["site"] not in [site.name for site in store.attributes.sites]:
         raise unknown_name("site", given["site"], [site.name for site in store.attributes.sites])
-    layer, first = (_number(given[name], "") for name in ("layer", "first"))
+    layer, first = (_whole(given[name]) for name in ("layer", "first"))
     return heads_of_run(store, given["site"], layer, given["selector"], first)
 
 
@@ -201,10 +208,22 @@ def _json(document: Any) -> Content:
 
 
 def _number(file: str, ending: str) -> int:
-    stem = file.removesuffix(ending)
-    if (ending and stem == file) or not stem.isdecimal() or len(stem) > 9:
+    if not file.endswith(ending):
         raise NothingThere
-    return int(stem)
+    return _whole(file.removesuffix(ending))
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or len(text) > 9:
+        raise NothingThere
+    return int(text)
+
+
+def _check_there(store: Store) -> None:
+    if isinstance(store.path, Path) and not store.path.exists():
+        raise StoreGone(
+            f"{store.path} is not there any more: it was moved or deleted. Put it back, or open another store."
+        )
 
 
 def _selector(query: Mapping[str, Sequence[str]]) -> str:

@@ -23,10 +23,18 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.action_changes import EFFECT, GRIPPER, ActionUnits
-from vla_attention.analyze.core.behaviour import named_things, told_goal
-from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
+from vla_attention.analyze.core.camera_maps import (
+    PictureMap,
+    map_note,
+    seen_cameras,
+    shared_out,
+    stored_picture,
+    upright,
+    view_of,
+)
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.measure import Measured, look_at, means
+from vla_attention.analyze.core.naming import told_things
 from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects, selected_items
 from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question, ask
@@ -36,7 +44,6 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, check_repla
 from vla_attention.analyze.measures.tables import LAYERS_AVG
 from vla_attention.analyze.render.style import group_styles
 from vla_attention.analyze.stores.rows import LayerRows, layer_rows
-from vla_attention.analyze.stores.run_notes import same_words, told_instruction
 from vla_attention.analyze.stores.selection import Selection, select
 from vla_attention.analyze.view.run_answers import episode_line
 from vla_attention.schemas.cached_property import cached_property
@@ -97,12 +104,8 @@ class ShownEpisode:
 
     @cached_property
     def named(self) -> set[str]:
-        """The objects that the policy was told about, see `named_things`; none where no goal says them."""
-        attributes = self.episode.attributes
-        told, steps = told_instruction(self.store, attributes), attributes.steps
-        aim = None if steps is None else told_goal(attributes, steps, told)
-        known = aim is not None or same_words(told, attributes.instruction)
-        return named_things(attributes, aim) if known else set()
+        """The objects that the policy was told about, see `told_things`; none where nobody knows which."""
+        return told_things(self.item(self._site_names[0])) or set()
 
     def about(self) -> dict[str, Any]:
         """`about.json`: what happened, and what every key is."""
@@ -271,9 +274,9 @@ class ShownEpisode:
         rows = self.rows(site, layer, heads=True)[at].mean(axis=0)  # (head, key)
         selection = replace(self._selection(site, layer), per_head=True)
         uniform = uniform_keys(item, selection)[:, 0].mean(axis=1)
-        valid, even = item.valid[min(at, len(item.valid) - 1)], uniform[min(at, len(uniform) - 1)]  # (head or 1, key)
-        # As much mass as the valid keys have, shared out as uniform attention does.
-        even = even * (rows[:, valid].sum(axis=1) / even[:, valid].sum(axis=1))[:, None]
+        # Where they are the same at all replans, or in all heads, they are there once.
+        valid, even = item.valid[min(at, len(item.valid) - 1)], uniform[min(at, len(uniform) - 1)]
+        even = shared_out(rows, even, valid)
         cameras = {}
         for camera in seen_cameras(item):
             picture, view = PictureMap.of(item.tokens.layout, camera), view_of(item, camera)

@@ -12,9 +12,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
-from vla_attention.analyze.view.answers import Answers, error_answer
+from vla_attention.analyze.view.answers import Answers, StoreGone, error_answer
 from vla_attention.analyze.view.kept_token import kept_token, new_token
 from vla_attention.analyze.view.paths import (
     BUNDLE,
@@ -119,8 +118,6 @@ class ViewerServer(ThreadingHTTPServer):
             if names == [RUNS]:
                 for store in self.stores:
                     store.refresh()
-            if gone := self._gone(names):
-                return Answer(HTTPStatus.GONE, *error_answer(gone))
             with ExitStack() as stack:  # what a person waits for goes before the list's numbers
                 for store in self.stores:
                     stack.enter_context(store.summary.paused())
@@ -131,19 +128,13 @@ class ViewerServer(ThreadingHTTPServer):
             return Answer(HTTPStatus.NOT_FOUND, b"There is nothing here.\n")
         except RemoteFailure as error:
             return Answer(HTTPStatus.BAD_GATEWAY, *error_answer(error))
+        except StoreGone as error:
+            return Answer(HTTPStatus.GONE, *error_answer(error))
         except UserError as error:
             # A browser logs every other status as an error; a wrong selector is the user's, and the page says it.
             return Answer(HTTPStatus.OK if query else HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
         except OSError as error:  # the store changes
             return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error.strerror or error))
-
-    def _gone(self, names: Sequence[str]) -> str:
-        """What is said where the store that an address is of is not there any more; empty where it is."""
-        number = names[1] if len(names) > 1 and names[1].isdecimal() and len(names[1]) < 9 else ""
-        place = self.stores[int(number)].store.path if number and int(number) < len(self.stores) else None
-        if not isinstance(place, Path) or place.exists():
-            return ""
-        return f"{place} is not there any more: it was moved or deleted. Put it back, or open another store."
 
 
 def _allowed_host(given: str) -> str:

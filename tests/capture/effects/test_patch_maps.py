@@ -12,7 +12,7 @@ import torch
 import zarr
 
 from tests.capture.effects.test_measurement import call_of, measurement
-from tests.capture.effects.test_recorded_effects import damaged
+from tests.capture.effects.test_recorded_effects import adds_alone, damaged
 from tests.capture.interventions.test_interventions_on_policies import policy_named
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
@@ -30,13 +30,7 @@ def mapped(tmp_path_factory) -> Path:
 
 
 def test_the_rest_of_the_store_is_as_without_a_map(pi_store, mapped):
-    plain, other = open_store(pi_store), open_store(mapped)
-    assert verify_store(other) == []
-    for mine, theirs in zip(plain.episodes, other.episodes, strict=True):
-        for name in mine.attributes.arrays:
-            assert mine.attributes.arrays[name] == theirs.attributes.arrays[name], name
-        added = set(theirs.attributes.arrays) - set(mine.attributes.arrays)
-        assert added == {"effects/change", "joint/cut", "effects/map", "effects/patch_change"}
+    adds_alone(pi_store, mapped, {"effects/change", "joint/cut", "effects/map", "effects/patch_change"})
 
 
 def test_the_strongest_patches_and_others_are_knocked_out(mapped):
