@@ -3,6 +3,7 @@
     python benchmarks/null_objects.py                        # 100 stores of each kind, some minutes
     python benchmarks/null_objects.py --stores 400           # the limit: 7 %, 5 % and two standard errors
     python benchmarks/null_objects.py --store runs/cubes.zarr
+    python benchmarks/null_objects.py --maps                 # of `effects`: that what is named moves the action more
 
 Stores have the scenes, sentences and first two policy calls of a real run of `cubes` (the shipped example, or
 `--store`), and made-up attention. In a null store it follows something in the picture, whatever the sentence says
@@ -32,10 +33,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import vla_attention as va
 from tests.kit.stores import StoreSpec, root_attributes
 from tests.kit.tokens import site_layout, small_prompt
-from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
+from vla_attention.analyze.commands.effects.maps import ASKS_NAMED
+from vla_attention.capture.store.replan_records import (
+    EpisodeStart,
+    RecordedRows,
+    ReplanEffects,
+    ReplanMap,
+    ReplanRecord,
+)
 from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.effects import EffectItem, EffectMap, EffectsRecorded, MapBlocks
 from vla_attention.schemas.episode_steps import HAND, POSES
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.interventions import Interventions, NoiseChange
 from vla_attention.schemas.layout import Prompt, Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import RootAttributes
@@ -173,8 +183,13 @@ def rows_of(scene: Scene, root: RootAttributes, follow: Follow, seed: int, plant
     return rows / rows.sum(axis=-1, keepdims=True)
 
 
-def write(path: Path, root: RootAttributes, scenes: Sequence[Scene], rows: Sequence[Array]) -> Path:
-    """A store of the scenes with these rows."""
+def write(path: Path, root: RootAttributes, scenes: Sequence[Scene], rows: Sequence[Array], maps: bool = False) -> Path:
+    """A store of the scenes with these rows; maps: also with a map of every patch, which moves the action as much as it
+    is attended to."""
+    if maps:
+        effects = EffectsRecorded(("map",), ("all",), 1, root.policy.num_denoise_steps, 1,
+                                  blocks=MapBlocks("hidden", 8, 8))  # fmt: skip
+        root = structs.replace(root, recording=structs.replace(root.recording, effects=effects))
     store = open_run(path, root, "new", durable=False)
     for scene, own in zip(scenes, rows, strict=True):
         with store.episode(scene.start, np.array([0.1])) as writer:
@@ -182,11 +197,25 @@ def write(path: Path, root: RootAttributes, scenes: Sequence[Scene], rows: Seque
                 recorded = RecordedRows.summed(own[replan].astype(np.float32)[None, None, None, None])
                 writer.append(ReplanRecord(
                     10 + 5 * replan, 1, {"joint": recorded}, {"joint": scene.key_role[replan]}, scene.prompt,
-                    np.zeros(8), np.zeros((5, 7)),
+                    np.zeros(8), np.random.default_rng([replan, scene.start.task_id]).normal(size=(5, 7)) * maps,
                     coverage={camera: area[replan] for camera, area in scene.coverage.items()},
+                    effects=_map_of(root, scene, own[replan]) if maps else None,
                 ))  # fmt: skip
             writer.commit(True, 5 * REPLANS, None)
     return path
+
+
+def _map_of(root: RootAttributes, scene: Scene, row: Array) -> ReplanEffects:
+    site = root.sites[0]
+    keys = tuple(int(key) for camera in scene.coverage for key in site.patch_keys(camera))
+    form = EffectMap(site.name, keys, 0, 5, (), (), (), (), "hidden", tuple(range(len(keys))))
+    sizes = row[list(keys)].astype(np.float32)
+    change = np.broadcast_to(sizes[:, None, None], (len(keys), 5, 7))
+    one = ReplanMap(form, sizes, tuple(range(len(keys))), (False,) * len(keys), change)
+    conditions = (Interventions("unchanged"), Interventions("noise", noise=NoiseChange(1)))
+    items, zeros = (EffectItem("nothing"), EffectItem("noise")), np.zeros((2, 5, 7), np.float32)
+    cut = {site.name: np.zeros((2, site.num_keys), np.float32)}
+    return ReplanEffects(conditions, items, (1.0,) * 7, (0, 1), zeros, cut, map=one)
 
 
 def without_states(scenes: Sequence[Scene]) -> list[Scene]:
@@ -194,18 +223,24 @@ def without_states(scenes: Sequence[Scene]) -> list[Scene]:
     return [replace(scene, start=replace(scene.start, initial_state_digest="")) for scene in scenes]
 
 
-def claims(path: Path) -> bool:
-    """Whether a sentence of the first screen of `objects` says that what is named gets more, or less."""
+def claims(path: Path, maps: bool = False) -> bool:
+    """Whether a sentence of the first screen of `objects` says that what is named gets more, or less.
+
+    maps: one of `effects`, that it moves the action more, or less.
+    """
+    if maps:
+        named = [finding for finding in va.open(path).effects().findings if finding.asks == ASKS_NAMED]
+        return bool(named and named[0].numbers["shown"])
     return any(finding.numbers.get("shown") and "form" in finding.numbers
                for finding in va.open(path).objects(iou=False).findings)  # fmt: skip
 
 
-def share_of(stores: int, make: Callable[[int, Path], Path]) -> float:
+def share_of(stores: int, make: Callable[[int, Path], Path], maps: bool = False) -> float:
     """In which share of so many stores something is claimed."""
     found = 0
     for number in range(stores):
         with tempfile.TemporaryDirectory() as folder:
-            found += claims(make(number, Path(folder) / "a.zarr"))
+            found += claims(make(number, Path(folder) / "a.zarr"), maps)
     return found / stores
 
 
@@ -261,19 +296,22 @@ def like_libero(suite: str, seed: int) -> tuple[RootAttributes, list[Scene]]:
     ), scenes
 
 
-def kinds(store: Path) -> Iterator[tuple[str, Callable[[int, Path], Path]]]:
+def kinds(store: Path, maps: bool = False) -> Iterator[tuple[str, Callable[[int, Path], Path]]]:
     """Name of a kind of stores, and what writes the store of a number to a path; no two kinds share their noise."""
     root, shared = scenes_of(store)
 
     def made(scenes: Sequence[Scene], name: str, planted: float = 1.0) -> Callable[[int, Path], Path]:
         first = 10_000 * (1 + list(FOLLOWS).index(name) + len(FOLLOWS) * (planted > 1))
         return lambda number, path: write(
-            path, root, scenes, [rows_of(scene, root, FOLLOWS[name], first + number, planted) for scene in scenes]
+            path, root, scenes, [rows_of(scene, root, FOLLOWS[name], first + number, planted) for scene in scenes], maps
         )
 
     for states, scenes in (("same states", shared), ("other tasks", without_states(shared))):
         for name in FOLLOWS:
             yield f"{name}, {states}", made(scenes, name)
+        if maps:
+            yield f"PLANTED: named twice, uniform, {states}", made(scenes, "uniform", PLANTED)
+            return
         yield f"thrice, {states}", lambda number, path, scenes=scenes: thrice(root, scenes, number, path)
         for name in ("uniform", "every cube alike"):
             yield f"PLANTED: named twice, {name}, {states}", made(scenes, name, PLANTED)
@@ -299,10 +337,11 @@ def main() -> None:
     parser.add_argument("--stores", type=int, default=100, help="stores of each kind (default: 100)")
     parser.add_argument("--store", type=Path, help="a run of cubes (default: the shipped example)")
     parser.add_argument("--only", default="", help="kinds whose name has this")
+    parser.add_argument("--maps", action="store_true", help="of maps of patches, as large as the attention would be")
     arguments = parser.parse_args()
-    for name, make in kinds(arguments.store or va.example("cubes")):
+    for name, make in kinds(arguments.store or va.example("cubes"), arguments.maps):
         if arguments.only in name:
-            print(f"{name:56} {100 * share_of(arguments.stores, make):5.1f} %", flush=True)
+            print(f"{name:56} {100 * share_of(arguments.stores, make, arguments.maps):5.1f} %", flush=True)
 
 
 if __name__ == "__main__":

@@ -128,7 +128,7 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
     numbers = {finding.asks: finding.numbers for finding in store.compare(paths[1]).findings}
     attention, looks = numbers.pop("And the attention?"), numbers.pop("Do they look for what is named?", {})
     tests = [float(p) for of in numbers.values() for name, p in of.items() if name.split("_")[0] == "p"]
-    named = [float(q) <= LEVEL / 6 for name, q in looks.items() if name.endswith("_ratio_q") and q is not None]
+    named = [float(q) <= LEVEL / 7 for name, q in looks.items() if name.endswith("_ratio_q") and q is not None]
     return min(tests, default=1.0) <= LEVEL or any(attention.values()) or any(named)
 
 

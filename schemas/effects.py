@@ -26,6 +26,9 @@ MAP, PATCH_CHANGE = "effects/map", "effects/patch_change"
 #: the prompt that is no piece of a word. `groups`: every group of a grouping, and everything but the group. `prompts`:
 #: the instruction, exchanged for every other sentence of a table. `map`: every patch, see `EffectMap`.
 EffectItems = Literal["text", "cameras", "objects", "tokens", "groups", "prompts", "map"]
+#: How a map takes something of the pictures away. `first order`: every patch, by first order, and the strongest ones
+#: exactly. `hidden`: blocks of patches, whose keys are cut off. `picture`: blocks of the picture, filled from around.
+MapWay = Literal["first order", "hidden", "picture"]
 #: Whose queries no longer read it. `all`: nobody reads it. `action`: the action queries alone. `pictures`, `text`: the
 #: tokens of pictures, or of the prompt, before the denoise steps.
 EffectReaders = Literal["all", "action", "pictures", "text"]
@@ -60,12 +63,31 @@ class OtherPrompt(Document, frozen=True):
         return PromptChange("empty" if self.kind == "empty" else "shuffled", meaning=self.kind)
 
 
+class MapBlocks(Document, frozen=True):
+    """The blocks that a map takes away exactly, one at a time: `rows` x `columns` of every camera's picture."""
+
+    way: Literal["hidden", "picture"]
+    rows: int
+    columns: int
+
+    def __post_init__(self) -> None:
+        """Check that there are blocks."""
+        if min(self.rows, self.columns) < 1 or self.rows * self.columns < 2:
+            raise BadArgument(
+                f"A map of {self.rows} x {self.columns} blocks of a picture; expected at least two blocks."
+            )
+
+    def describe(self) -> str:
+        """What happens to a block, in words."""
+        return "hidden" if self.way == "hidden" else "filled from its surroundings in the picture"
+
+
 class EffectsRecorded(Document, frozen=True):
     """Which effects a run measures.
 
     `every`: at every so many replans, from the first on. `denoise_steps`: network evaluations of a changed call.
     `seed`: of the random keys, and of the other noise. `groups`: the selector of each group, by name. `prompts`: the
-    prompt table.
+    prompt table. `blocks`: of the map; None for one by first order.
     """
 
     items: tuple[EffectItems, ...]
@@ -75,6 +97,7 @@ class EffectsRecorded(Document, frozen=True):
     seed: int
     groups: dict[str, str] = field(default_factory=dict)
     prompts: tuple[OtherPrompt, ...] = ()
+    blocks: MapBlocks | None = None
 
     def __post_init__(self) -> None:
         """Check that something is measured, and the numbers."""
@@ -108,16 +131,18 @@ class EffectItem(Document, frozen=True):
 
 
 class EffectMap(Document, frozen=True):
-    """Which patches move the actions of an episode's calls, all queries without a patch at a time.
+    """Which patches move the actions of an episode's calls, one patch or block of patches at a time.
 
-    Row i of `effects/map` (row, patch) is of replan `replan[i]`: by first order, from `projections` random directions,
-    how far the first `steps` actions change without each patch, root mean square of the normalised actions. It is an
-    order; sizes are those of `effects/patch_change`, whose entry i is the exact change without patch `patch[i]` at
-    replan `patch_replan[i]`, in the units of the episode's effects. Of each replan these are its strongest patches by
-    first order, and some of the others that were drawn at random (`drawn[i]`), which say how far the order can be
-    trusted.
+    Row i of `effects/map` (row, block) is of replan `replan[i]`: how far the first `steps` actions change without each
+    block, root mean square of the normalised actions. By `first order`, from `projections` random directions, it is an
+    order of the patches; sizes are those of `effects/patch_change` alone, whose entry i is the exact change without
+    block `patch[i]` at replan `patch_replan[i]`, in the units of the episode's effects. Of each replan these are its
+    strongest patches by first order, and some of the others that were drawn at random (`drawn[i]`), which say how far
+    the order can be trusted. Of the other ways (`MapWay`) they are all blocks that show a part of a picture, and the
+    map has their sizes.
 
-    keys: of the patches, at the site `site`, cameras in the order of its keys.
+    keys: of the patches, at the site `site`, cameras in the order of its keys. blocks: the block of each of them; empty
+    where each is its own. reader: whose queries do without it, empty where the picture is another one.
     """
 
     site: str
@@ -128,15 +153,25 @@ class EffectMap(Document, frozen=True):
     patch_replan: tuple[int, ...]
     patch: tuple[int, ...]
     drawn: tuple[bool, ...]
+    way: MapWay = "first order"
+    blocks: tuple[int, ...] = ()
+    reader: EffectReaders | Literal[""] = "all"
+
+    @property
+    def num_blocks(self) -> int:
+        """Length of a row of the map."""
+        return max(self.blocks, default=-1) + 1 if self.blocks else len(self.keys)
 
     def __post_init__(self) -> None:
-        """Check that entries are of replans and patches of the map."""
+        """Check that entries are of replans and blocks of the map."""
         if not len(self.patch) == len(self.patch_replan) == len(self.drawn) or not set(self.patch_replan) <= set(
             self.replan
         ):
             raise BadArgument("Exact changes of a map are of other replans than its rows.")
-        if any(not 0 <= one < len(self.keys) for one in self.patch):
-            raise BadArgument(f"Exact changes of a map are of patches beyond its {len(self.keys)}.")
+        if self.blocks and (len(self.blocks) != len(self.keys) or set(self.blocks) != set(range(max(self.blocks) + 1))):
+            raise BadArgument(f"A map of {len(self.keys)} patches has blocks of others, or without a patch.")
+        if any(not 0 <= one < self.num_blocks for one in self.patch):
+            raise BadArgument(f"Exact changes of a map are of blocks beyond its {self.num_blocks}.")
 
 
 class EpisodeEffects(Document, frozen=True):

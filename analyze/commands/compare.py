@@ -30,8 +30,9 @@ _BETTER, _LISTEN, _MOVED, _NEEDS, _ATTENTION = (
     "Which does better?", "Do they listen?", "How far do the actions move?", "What do the actions depend on?",
     "And the attention?",
 )  # fmt: skip
-#: Differences of five kinds are named: effects, groups, objects, words and heads; and of each run what it looks for.
-_SURE = pl.col("difference_q") <= NAMED_AT / 6
+#: Kinds whose differences are named: effects, maps, groups, objects, words, heads; and of each run what it looks for.
+_KINDS = 7
+_SURE = pl.col("difference_q") <= NAMED_AT / _KINDS
 _MOST_NAMED = 3  # differences of a kind
 
 
@@ -57,7 +58,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
         if not part.other.run.repeats(first):
             findings += _behaved(part, told[first.name], told[part.name])
         findings += [*_needs(part), _attention(part)]
-    findings += of_runs({one.run.name: one.named for one in (base, *rest)}, NAMED_AT / 6)
+    findings += of_runs({one.run.name: one.named for one in (base, *rest)}, NAMED_AT / _KINDS)
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
     about += [line for part in parts for line in _how_alike(part)]
     about += dict.fromkeys(line for run in runs for line in run.question.told)
@@ -230,6 +231,10 @@ def _needs(part: Compared) -> list[Finding]:
         without = "without" if row["kind"] == "without" else "with"
         said.append(f"{without} {row['label']} {moved_by} (against {2.0 ** row['mean_first']:.2g})")
     numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}
+    maps = part.rows["maps"].filter(ALL) if "maps" in part.rows else rows.clear()
+    for row in _largest(maps).iter_rows(named=True):
+        on = {"named": "what the sentence names", "robot": "the robot", "other": "neither named things nor the robot"}
+        said.append(f"{100 * row['difference']:+.0f} points of what patches do to the action lie on {on[row['item']]}")
     text = "; ".join(said) if said else "no item's effect is shown to differ"
     limit = "Trust exchanged words more than missing ones: a sentence with a missing word is new to the policy."
     return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers, limit)]

@@ -153,6 +153,11 @@ _EACH = (
         [Column("label", "text", "without, or changed")],
         "How far the action moves",
     ),
+    (
+        "maps",
+        [Column("item", "text", "on", "what the sentence names, the robot, or neither")],
+        "Patches that move the action: the part of it",
+    ),
     ("objects", [Column("item", "text", "object")], "Attention to objects, over that of their area"),
     ("words", [_WORD], "Attention to words, evenly spread = 1"),
     ("heads", [_LAYER, _HEAD], "Heads: their attention on the first side of the ratio"),

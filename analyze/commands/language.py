@@ -12,6 +12,7 @@ from dataclasses import replace
 import polars as pl
 
 from vla_attention.analyze.commands.effects import word_effects
+from vla_attention.analyze.commands.effects.maps import ASKS_NAMED, maps_where_recorded
 from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
@@ -47,6 +48,7 @@ def language(question: Question) -> Result:
     by_change, changes = _perturbed(question, asked)
     reached = words_get_through(question)
     decide, effects = word_effects(question)
+    named = [finding for finding in maps_where_recorded(question)[0] if finding.asks == ASKS_NAMED]
     read = words(question)
     missing = len(question.selected) - asked.height
     rerun = all(store.attributes.rerun_of is not None for store in question.stores)
@@ -56,7 +58,7 @@ def language(question: Question) -> Result:
     return Result(
         "Does it listen? What was told, and what was done",
         about(question),
-        [*reached, *first, *by_change, *followed, *decide, *read.findings[:1], *last],
+        [*reached, *first, *by_change, *followed, *decide, *named, *read.findings[:1], *last],
         [*changes, *matrix, *(() if matrix else done[:1]), *effects, *done[1:], *read.tables[:1]],
         [*pictured, *read.figures[:1]],
         [*([] if rerun else left), *notes(question)],

@@ -1,4 +1,4 @@
-"""Does it look for what the instruction names? And which objects are looked at, over their area and their places."""
+"""Does it look for what the instruction names? Which objects are looked at, over area and place, and which move it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import polars as pl
 
+from vla_attention.analyze.commands.effects.maps import maps_where_recorded
 from vla_attention.analyze.commands.naming_tables import (
     ASKS,
     figures_of_naming,
@@ -93,8 +94,9 @@ def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> R
     if not by:
         named, times = naming(question, measured, found), course(question, measured)
         finding = of_naming(question, named) or of_objects(question, named, at_objects(question, measured, found))
-        findings, (first, last) = [replace(finding, next_step=step)], tables_of_naming(named, times)
-        tables, figures = [*first, *tables, *last], [*figures_of_naming(named, times), *figures]
+        moves, of_patches = maps_where_recorded(question)
+        findings, (first, last) = [replace(finding, next_step=step), *moves], tables_of_naming(named, times)
+        tables, figures = [*first, *tables, *last, *of_patches], [*figures_of_naming(named, times), *figures]
     if iou and of_maps:
         pointing, overlaps = (
             frame_of_episodes(found, lambda one: one.pointing), frame_of_episodes(found, lambda one: one.iou)

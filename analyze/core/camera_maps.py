@@ -250,9 +250,7 @@ def camera_names(question: Question, wanted: Sequence[str] | None = None) -> tup
 def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[str]) -> EpisodeMaps:
     """Read one episode's attention, mean over the selected layers, denoise steps and heads."""
     tokens, selection = item.tokens, question.selection
-    rows = layer_rows(item.store.attributes, item.episode, selection, question.site, per_head=False)
-    parts = [part.rows[:, 0].astype(np.float64) for part in rows if part.layer in selection.once]
-    mean = sum(parts, np.zeros(())) / len(parts)  # (replan, key)
+    mean = mean_rows(question, item)
     # Of a patch beside a picture that was fitted in, what shows the picture counts.
     shown = np.ones(mean.shape[1]) if tokens.border is None else 1.0 - tokens.border
     image = mean * shown * (tokens.static_roles == int(Role.IMAGE))
@@ -275,6 +273,15 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
             for replan, prompt in enumerate(tokens.prompt_index)
         ] if tokens.prompt_index is not None and tokens.words else []  # fmt: skip
     return EpisodeMaps(item, item.episode.read("env_step").astype(np.int64), maps, whole, words)
+
+
+def mean_rows(question: Question, item: SelectedEpisode) -> Array:
+    """An episode's attention, mean over the selected layers, denoise steps and heads, (replan, key)."""
+    selection = question.selection
+    rows = layer_rows(item.store.attributes, item.episode, selection, question.site, per_head=False)
+    parts = [part.rows[:, 0].astype(np.float64) for part in rows if part.layer in selection.once]
+    mean: Array = sum(parts, np.zeros(())) / len(parts)
+    return mean
 
 
 def shared_out(mass: Array, uniform: Array, valid: NDArray[np.bool_]) -> Array:

@@ -23,6 +23,7 @@ from vla_attention.analyze.core.measure import Measured, look_at, table_of
 from vla_attention.analyze.core.naming import Naming, ObjectAttention, looks_at_objects, named_in
 from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.pairs import MOST_APART, pairing, pairs_of, with_first_pictures
+from vla_attention.analyze.core.patch_maps import calls_of_maps, episodes_of_maps, patch_maps
 from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
@@ -41,6 +42,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "words": (("item",), ()),
     "objects": (("item",), ()),
     "effects": ((*ITEM, "reader"), ("reader",)),
+    "maps": (("item",), ()),
 }
 _TASK = ["suite", "task_id", "instruction"]
 
@@ -167,6 +169,8 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
         of_sides, units = effects
         for side, of_side in zip(sides, of_sides, strict=True):
             side["effects"] = of_side
+        for side, of_side in zip(sides, _maps(first.run, other.run, units), strict=False):
+            side["maps"] = of_side
     rows, values = {}, {}
     for kind, (item, looks) in KINDS.items():
         if not all(kind in side for side in sides):
@@ -204,6 +208,20 @@ def _effects(first: Run, other: Run) -> tuple[list[pl.DataFrame], ActionUnits] |
         rows = pl.concat([exchanged, rows.filter(pl.col("reader").is_in(["total", "direct"]))], how="diagonal")
         tables.append(rows.select(*EPISODE_ID, *ITEM, "reader", value=pl.col("effect").log(2.0)))
     return tables, units
+
+
+def _maps(first: Run, other: Run, units: ActionUnits) -> list[pl.DataFrame]:
+    """The parts of what moves the action, of `patch_maps`, of both runs; none unless both have maps made alike."""
+    maps = [patch_maps(run.question, units) for run in (first, other)]
+    if any(one.is_empty() for one in maps) or len({way for one in maps for way in one["way"].unique()}) > 1:
+        return []
+    which = "top" if maps[0]["way"][0] == "first order" else "all"
+    names = {f"{which}_{name}": name for name in ("named", "robot", "other")}
+    found = []
+    for run, patches in zip((first, other), maps, strict=True):
+        episodes = episodes_of_maps(calls_of_maps(patches, run.question)).rename(names)
+        found.append(episodes.unpivot(list(names.values()), index=EPISODE_ID, variable_name="item"))
+    return found
 
 
 def strip_of_pair(

@@ -113,16 +113,26 @@ def naming(question: Question, measured: Sequence[Measured], found: Sequence[Obj
     kinds = by_kind(cases.with_columns(camera=pl.lit(ALL_CAMERAS), x=pl.lit(0.0)))
     always = tuple(kinds.filter(pl.col("named").all().over("suite", "item"))["item"].unique().sort())
     shares = first_calls(measured)
-    x = shares.select(*EPISODE_ID, "camera", "item", x=pl.col("share").log())
-    states = cases.filter(pl.col("state") != "").join(x, on=[*EPISODE_ID, "item"])
-    states = states.with_columns(stratum=pl.concat_str("suite", "state", separator=" "))
-    one = _compared(question, "same state", states, always)
+    one = in_same_states(question, shares.select(*EPISODE_ID, "camera", "item", x=pl.col("share").log()), always)
     if one.form is not None or cases.is_empty():
         return one
     x = over_place(question, found).filter(kind="object", layer=LAYERS_AVG)
     x = x.select(*EPISODE_ID, "camera", "item", x=(pl.col("at_place") / pl.col("elsewhere")).log())
     kinds = by_kind(cases.join(x, on=[*EPISODE_ID, "item"]))
     return _compared(question, "other tasks", kinds.with_columns(stratum="suite"), always)
+
+
+def in_same_states(question: Question, x: pl.DataFrame, always: tuple[str, ...] = ()) -> Naming:
+    """Named against not named in episodes that begin in the same state.
+
+    Args:
+        question: its episodes.
+        x: EPISODE_ID, camera, item, x: the logarithm of what is compared, at the first policy call.
+        always: see `Naming`.
+    """
+    states = _cases(question).filter(pl.col("state") != "").join(x, on=[*EPISODE_ID, "item"])
+    states = states.with_columns(stratum=pl.concat_str("suite", "state", separator=" "))
+    return _compared(question, "same state", states, always)
 
 
 @dataclass(frozen=True)

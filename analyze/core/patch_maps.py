@@ -1,27 +1,34 @@
 """Which patches move the action (`schemas.effects.EffectMap`): how far a map can be trusted, and what lies on what.
 
-Of every measured policy call the strongest patches by first order were taken away one at a time, all queries without
-them; sizes are of these exact calls alone. Its top tenth are the tenth of all patches with the largest of these sizes.
-With s the sizes of the top tenth and c the part of each patch that a thing covers,
+Sizes are of exact calls without a patch, or a block of them, alone. Of a map by first order only the strongest were
+made: its top tenth are the tenth of all patches with the largest of these sizes. Of a map of blocks all were. With s
+the sizes of the top tenth, or of all blocks, and c the part of each that a thing covers,
 
     the thing's part = Σ s·c / Σ s
 
-and the Nuisance Mass Ratio of the top tenth, NMR@10 (arXiv 2605.00321), the part that is on neither the named things
-nor the robot. Of the other patches some were drawn at random: Spearman's correlation of their first order with their
-exact sizes, root mean square of the normalised actions as the first order is, says how far the order of the map can be
-trusted. Sizes below those of an unchanged call are rounding, and left out of it.
+and the Nuisance Mass Ratio of the top tenth, NMR@10 (after arXiv 2605.00321), the part that is on neither the named
+things nor the robot. Beside each stands the same sum over attention: of its own top tenth, or of all. Sizes below those
+of an unchanged call are rounding, and count as 0.
+
+Of a map by first order some of the other patches were drawn at random: Spearman's correlation of their first order with
+their exact sizes, root mean square of the normalised actions as the first order is, says how far the order of the map
+can be trusted.
 """
 
 from __future__ import annotations
+
+from collections.abc import Collection
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import ActionUnits, BaseEpisode
-from vla_attention.analyze.core.axes import with_families
+from vla_attention.analyze.core.axes import columns_of, with_families
+from vla_attention.analyze.core.camera_maps import mean_rows
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.naming import told_things
+from vla_attention.analyze.core.naming import Naming, in_same_states, told_things
+from vla_attention.analyze.core.object_shares import ALL_CAMERAS
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.tables import EPISODE_ID, episode_columns
@@ -33,36 +40,42 @@ Array = NDArray[np.float64]
 TOP, TRUSTED = 0.1, 0.5
 #: With fewer patches above rounding, their order says nothing.
 _FEWEST_DRAWN = 4
+#: Columns of `patch_maps` that are of things, beside those of single objects.
+_THINGS = ("named", "robot")
+_OBJECT = "object:"
 
 
-def patch_maps(question: Question, units: ActionUnits) -> pl.DataFrame:
-    """One row per patch of every policy call with a map that shows a part of a picture; none where no store has a map.
-
-    Returns:
-        suite, task_id, episode_index, replan, patch (place on the map's axis), key; first_order (an order alone);
-        exact, the first part of `units` without the patch, and exact_rms, of the normalised actions; floor, the same of
-        an unchanged call: less is rounding; drawn: whether it was drawn at random; named, robot: the parts of the patch
-        that what the sentence names and the robot cover, null where that is not known.
-    """
-    frames = [_patches(item, units) for item in question.selected if _map_of(item) is not None]
-    return pl.concat(frames) if frames else pl.DataFrame(schema=_SCHEMA)
+def any_map(question: Question) -> bool:
+    """Whether a selected episode holds a map."""
+    return any(map_of(item) is not None for item in question.selected)
 
 
-_SCHEMA = {"suite": pl.String, "task_id": pl.Int64, "episode_index": pl.Int64, "replan": pl.Int64, "patch": pl.Int64,
-           "key": pl.Int64, "first_order": pl.Float64, "exact": pl.Float64, "exact_rms": pl.Float64,
-           "floor": pl.Float64, "drawn": pl.Boolean, "named": pl.Float64, "robot": pl.Float64}  # fmt: skip
-
-
-def _map_of(item: SelectedEpisode) -> EffectMap | None:
+def map_of(item: SelectedEpisode) -> EffectMap | None:
+    """The map of an episode; None without one."""
     effects = item.episode.attributes.effects
     return None if effects is None else effects.map
 
 
-def _patches(item: SelectedEpisode, units: ActionUnits) -> pl.DataFrame:
-    effects, one = item.episode.attributes.effects, _map_of(item)
+def patch_maps(question: Question, units: ActionUnits) -> pl.DataFrame:
+    """One row per block of every policy call with a map at the question's site that shows a part of a picture.
+
+    Returns:
+        suite, task_id, episode_index, success, replan, way (of `MapWay`), patch (place on the map's axis), key (the
+        first of the block's), num_keys; first_order (an order alone; null in other maps); exact, the first part of
+        `units` without it, and exact_rms, of the normalised actions; floor, the same of an unchanged call: less is
+        rounding; drawn: whether it was drawn at random; attention: of the action queries to its keys; named, robot: the
+        parts of it that what the sentence names and the robot cover, null where that is not known; and the same of each
+        object, as "object:NAME".
+    """
+    frames = [_patches(question, item, one, units) for item in question.selected
+              if (one := map_of(item)) is not None and one.site == question.site]  # fmt: skip
+    return pl.concat(frames, how="diagonal") if frames else pl.DataFrame()
+
+
+def _patches(question: Question, item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> pl.DataFrame:
+    effects = item.episode.attributes.effects
     assert effects is not None
-    assert one is not None
-    first, (rows, patches) = item.episode.read(MAP).astype(np.float64), (len(one.replan), len(one.keys))
+    rows, patches = len(one.replan), one.num_blocks
     exact, rms, drawn = (np.full((rows, patches), np.nan) for _ in range(3))
     if one.patch:
         row = np.searchsorted(one.replan, one.patch_replan)
@@ -71,20 +84,29 @@ def _patches(item: SelectedEpisode, units: ActionUnits) -> pl.DataFrame:
         exact[row, one.patch] = units.changes(at, at.actions + normalised * np.array(effects.units))[:, 0]
         rms[row, one.patch] = np.sqrt((normalised[:, : one.steps] ** 2).mean(axis=(1, 2)))
         drawn[row, one.patch] = one.drawn
-    named, robot = _covered(item, one)
-    floor = np.repeat(_floor(item, one)[:, None], patches, axis=1)
+    first = item.episode.read(MAP).astype(np.float64) if one.way == "first order" else np.full_like(exact, np.nan)
+    block = np.array(one.blocks or range(patches))
+    keys, number = np.array(one.keys), np.bincount(block)
+    # Of every block the sum over its keys: (..., key) @ (key, block).
+    of_block = np.zeros((len(keys), patches))
+    of_block[np.arange(len(keys)), block] = 1.0
+    calls = np.array(one.replan)
     roles = item.tokens.static_roles
-    seen = (roles[np.minimum(one.replan, len(roles) - 1)][:, list(one.keys)] == Role.IMAGE).ravel()
-    columns = episode_columns(item, EPISODE_ID, rows * patches)
-    values = {"first_order": first, "exact": exact, "exact_rms": rms, "floor": floor, "drawn": drawn,
-              "named": named, "robot": robot}  # fmt: skip
+    seen = ((roles[np.minimum(calls, len(roles) - 1)][:, keys] == Role.IMAGE) @ of_block > 0).ravel()
+    values = {"first_order": first, "exact": exact, "exact_rms": rms, "drawn": drawn,
+              "floor": np.repeat(_floor(item, one)[:, None], patches, axis=1),
+              "attention": mean_rows(question, item)[calls][:, keys] @ of_block}  # fmt: skip
+    values |= {name: cover[calls][:, keys] @ of_block / number for name, cover in _covered(item).items()}
+    columns = episode_columns(item, [*EPISODE_ID, "success"], rows * patches)
     return (
         pl.DataFrame(
             {
                 **columns,
-                "replan": np.repeat(np.array(one.replan, np.int64), patches),
+                "replan": np.repeat(calls.astype(np.int64), patches),
+                "way": [one.way] * (rows * patches),
                 "patch": np.tile(np.arange(patches), rows),
-                "key": np.tile(np.array(one.keys, np.int64), rows),
+                "key": np.tile(keys[np.unique(block, return_index=True)[1]], rows),
+                "num_keys": np.tile(number, rows),
                 **{name: pl.Series(array.ravel(), nan_to_null=True) for name, array in values.items()},
             }
         )
@@ -105,58 +127,95 @@ def _floor(item: SelectedEpisode, one: EffectMap) -> Array:
     return found
 
 
-def _covered(item: SelectedEpisode, one: EffectMap) -> tuple[Array, Array]:
-    """The parts (row, patch) of each patch that the named things and the robot cover; NaN where that is not known."""
-    unknown = np.full((len(one.replan), len(one.keys)), np.nan)
-    named, coverage, layout = told_things(item), item.tokens.coverage, item.tokens.layout
+def _covered(item: SelectedEpisode) -> dict[str, Array]:
+    """The parts (replan, key) of each patch that things cover, see `patch_maps`; NaN where that is not known."""
+    tokens, things, layout = item.tokens, item.tokens.objects, item.tokens.layout
+    unknown = np.full((tokens.num_replans, layout.num_keys), np.nan)
+    named, coverage = told_things(item), tokens.coverage
     if named is None or not coverage:
-        return unknown, unknown
-    things = item.tokens.objects
-    parts = []
-    for chosen in ([thing.name in named for thing in things], [thing.kind == "robot" for thing in things]):
-        of_keys = np.full((item.tokens.num_replans, layout.num_keys), np.nan)
-        for camera, shares in coverage.items():
-            of_keys[:, layout.patch_keys(camera)] = shares[..., chosen].sum(axis=-1)
-        parts.append(of_keys[np.array(one.replan)][:, list(one.keys)])
-    return parts[0], parts[1]
+        return dict.fromkeys(_THINGS, unknown)
+    each = np.full((tokens.num_replans, layout.num_keys, len(things)), np.nan)
+    for camera, shares in coverage.items():
+        each[:, layout.patch_keys(camera)] = shares
+    found = {"named": each[..., [thing.name in named for thing in things]].sum(axis=-1)}
+    found["robot"] = each[..., [thing.kind == "robot" for thing in things]].sum(axis=-1)
+    return found | {f"{_OBJECT}{thing.name}": each[..., i] for i, thing in enumerate(things)}
 
 
-def episodes_of_maps(patches: pl.DataFrame, question: Question) -> pl.DataFrame:
-    """Means over the policy calls of every episode.
+def calls_of_maps(patches: pl.DataFrame, question: Question) -> pl.DataFrame:
+    """The numbers of every policy call.
 
     Returns:
-        suite, task_id, episode_index, family, num_calls; rank: of the patches that were drawn; named, robot, other: the
-        parts of the top tenth; area_named, area_robot: those of the pictures.
+        suite, task_id, episode_index, success, family, replan, way; rank: of the patches that were drawn; top_named,
+        top_robot, top_other (NMR@10): the parts of the top tenth; all_named, ...: of all blocks, null by first order;
+        the same of attention, as attention_top_named, ...; area_named, area_robot: of the pictures.
     """
-    groups = patches.group_by([*EPISODE_ID, "replan"], maintain_order=True)
-    calls = pl.DataFrame([_of_call(call) for _, call in groups], schema=_OF_CALL)
-    means = pl.mean("rank", *_SHARES)
-    episodes = calls.group_by(EPISODE_ID, maintain_order=True).agg(means, num_calls=pl.len())
-    return with_families(episodes, question.sampling)
+    groups = patches.group_by([*EPISODE_ID, "replan", "way"], maintain_order=True)
+    schema = {name: patches.schema[name] for name in (*EPISODE_ID, "success", "replan", "way")}
+    schema |= dict.fromkeys(("rank", *SHARES), pl.Float64())
+    calls = pl.DataFrame([_of_call(call) for _, call in groups], schema=schema)
+    return with_families(calls, question.sampling)
 
 
-#: Parts of the size of the top patches, and of the pictures.
-_SHARES = ("named", "robot", "other", "area_named", "area_robot")
-_OF_CALL = {name: _SCHEMA[name] for name in EPISODE_ID} | dict.fromkeys(("rank", *_SHARES), pl.Float64)
+_PARTS = tuple(f"{which}_{thing}" for which in ("top", "all") for thing in (*_THINGS, "other"))
+#: Parts of sizes, of attention, and of the pictures.
+SHARES = (*_PARTS, *(f"attention_{name}" for name in _PARTS), *(f"area_{name}" for name in _THINGS))
 
 
 def _of_call(call: pl.DataFrame) -> dict[str, object]:
     """The numbers of one policy call; None where it has them not."""
+    found: dict[str, object] = {name: call[name][0] for name in (*EPISODE_ID, "success", "replan", "way")}
     drawn = call.filter(pl.col("drawn") & (pl.col("exact_rms") > pl.col("floor")))
-    found: dict[str, object] = {name: call[name][0] for name in EPISODE_ID}
     if drawn.height >= _FEWEST_DRAWN:
         found["rank"] = drawn.select(pl.corr("first_order", "exact_rms", method="spearman").fill_nan(None)).item()
-    strongest = call.drop_nulls("exact").filter(~pl.col("drawn")).sort("exact", descending=True)
-    top = strongest.head(max(1, round(TOP * call.height)))
-    whole = float(top["exact"].sum())
-    if not whole or top["named"].null_count():
+    if call["named"].null_count():
         return found
-    named, robot = (float((top["exact"] * top[name]).sum()) / whole for name in ("named", "robot"))
-    areas = {f"area_{name}": call[name].mean() for name in ("named", "robot")}
-    return found | {"named": named, "robot": robot, "other": max(0.0, 1.0 - named - robot)} | areas
+    found |= {f"area_{name}": call[name].mean() for name in _THINGS}
+    above = pl.when(pl.col("exact_rms") > pl.col("floor")).then("exact").otherwise(0.0)
+    sized = call.drop_nulls("exact").filter(~pl.col("drawn")).with_columns(size=above)
+    top = max(1, round(TOP * call.height))
+    found |= _parts(sized.sort("size", descending=True).head(top), "size", "top_")
+    read = call.sort("attention", descending=True)
+    found |= _parts(read.head(top), "attention", "attention_top_")
+    if call["exact"].null_count() == 0:
+        found |= _parts(sized, "size", "all_") | _parts(read, "attention", "attention_all_")
+    return found
 
 
-def summary_of_maps(episodes: pl.DataFrame, question: Question) -> pl.DataFrame:
-    """One row: rank, named, robot, other, area_named, area_robot with their intervals; see `estimate`."""
-    scales: dict[str, Scale] = {"rank": "correlation", **dict.fromkeys(_SHARES, "share")}
-    return estimate(episodes.with_columns(all=pl.lit("")), ["all"], scales, question.sampling).drop("all")
+def _parts(rows: pl.DataFrame, size: str, before: str) -> dict[str, object]:
+    """The parts of a size that lie on what is named, the robot and neither; empty where it is 0."""
+    whole = float(rows[size].sum())
+    if not whole:
+        return {}
+    named, robot = (float((rows[size] * rows[name]).sum()) / whole for name in _THINGS)
+    parts = {"named": named, "robot": robot, "other": max(0.0, 1.0 - named - robot)}
+    return {f"{before}{name}": value for name, value in parts.items()}
+
+
+def episodes_of_maps(calls: pl.DataFrame, by: Collection[str] = ()) -> pl.DataFrame:
+    """Means over the policy calls of every episode, of each one where `by` has replan; see `calls_of_maps`."""
+    keys = [*EPISODE_ID, "success", "family", "way", *(["replan"] if "replan" in by else [])]
+    means = [pl.col(name).mean() for name in ("rank", *SHARES)]
+    return calls.group_by(keys, maintain_order=True).agg(means, num_calls=pl.len())
+
+
+def summary_of_maps(episodes: pl.DataFrame, question: Question, by: Collection[str] = ()) -> pl.DataFrame:
+    """One row for each way and what is kept apart: rank and `SHARES` with their intervals; see `estimate`."""
+    scales: dict[str, Scale] = {"rank": "correlation", **dict.fromkeys(SHARES, "share")}
+    kept = ["way", *(column.name for column in columns_of(by) if column.name in episodes.columns)]
+    return estimate(episodes, kept, scales, question.sampling)
+
+
+def named_in_maps(question: Question, patches: pl.DataFrame) -> Naming:
+    """Named against not named, as `core.naming`: of each object its part of the sizes, in maps of blocks."""
+    exact = patches.filter(pl.col("way") != "first order", replan=0) if patches.height else patches
+    names = [name for name in patches.columns if name.startswith(_OBJECT)]
+    if exact.is_empty() or not names:
+        return Naming(None, pl.DataFrame(), pl.DataFrame(), ())
+    parts = [(pl.col("exact") * pl.col(name)).sum().alias(name) / pl.col("exact").sum() for name in names]
+    wide = exact.group_by(EPISODE_ID, maintain_order=True).agg(parts)
+    x = wide.unpivot(names, index=EPISODE_ID, variable_name="item", value_name="x")
+    logs = x.filter(pl.col("x") > 0).select(
+        *EPISODE_ID, pl.lit(ALL_CAMERAS).alias("camera"), pl.col("item").str.strip_prefix(_OBJECT), pl.col("x").log()
+    )
+    return in_same_states(question, logs)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import re
 from dataclasses import dataclass, fields
 from typing import get_args
 
-from vla_attention.schemas.effects import EffectReaders, OtherPrompt
+from vla_attention.schemas.effects import EffectReaders, MapBlocks, OtherPrompt
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.options import add_options, option, read_options
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
@@ -15,8 +16,9 @@ from vla_attention.schemas.stores.store_url import StorePlace, store_place
 GROUPING = "grouping:"
 #: Prompt tables: the one that is made of the tasks, and the beginning of one that names a file.
 STANDARD, TABLE = "standard", "table:"
-#: What effects can be of, as it is typed.
-ITEMS = ("text", "cameras", "objects", "tokens", "map", f"{GROUPING}FILE")
+#: What effects can be of, as it is typed; a map in one of three forms.
+ITEMS = ("text", "cameras", "objects", "tokens", "map", "map:8x8", "map:picture:8x8", f"{GROUPING}FILE")
+_MAP = re.compile(r"map(?::(?P<picture>picture:)?(?P<rows>\d{1,3})x(?P<columns>\d{1,3}))?")
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,10 @@ class EffectSettings:
         groupings = tuple(dict.fromkeys(word for word in self.items if word.startswith(GROUPING)))
         if len(groupings) > 1:
             raise BadArgument(f"Effects take the groups of one grouping, not of {listing(groupings)}.")
-        for name, known in (("items", (*ITEMS[:-1], *groupings)), ("readers", get_args(EffectReaders))):
+        maps = tuple(dict.fromkeys(word for word in self.items if _MAP.fullmatch(word)))
+        if len(maps) > 1:
+            raise BadArgument(f"Effects take one map, not {listing(maps)}.")
+        for name, known in (("items", (*ITEMS[:4], *maps, *groupings)), ("readers", get_args(EffectReaders))):
             words = getattr(self, name)
             for word in words:
                 if word not in known:
@@ -85,6 +90,20 @@ class EffectSettings:
                     near = did_you_mean(word, expected)
                     raise BadArgument(f"Effects have no {name[:-1]} '{word}'; expected {listing(expected)}.{near}")
             object.__setattr__(self, name, tuple(word for word in known if word in words))
+        self.blocks  # noqa: B018 (raises for a map without blocks)
+
+    @property
+    def map_form(self) -> str:
+        """The map as it was typed; empty without one."""
+        return next((word for word in self.items if _MAP.fullmatch(word)), "")
+
+    @property
+    def blocks(self) -> MapBlocks | None:
+        """The blocks of the map; None without one, and for one by first order."""
+        form = _MAP.fullmatch(self.map_form)
+        if form is None or form["rows"] is None:
+            return None
+        return MapBlocks("picture" if form["picture"] else "hidden", int(form["rows"]), int(form["columns"]))
 
     @property
     def grouping(self) -> str | None:

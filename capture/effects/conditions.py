@@ -10,10 +10,11 @@ from typing import get_args
 from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
+from vla_attention.capture.effects.patch_maps import check_map
 from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group, plain
 from vla_attention.capture.interventions.prompts import with_synonyms
 from vla_attention.capture.interventions.resolution import run_vocabularies
-from vla_attention.capture.policies.policy import MapPolicy, Policy, PolicyInput, UnitsPolicy, VariantPolicy
+from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.schemas.effects import EffectItem, EffectItemKind, EffectItems, EffectReaders, EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS, find_grouping
@@ -55,12 +56,7 @@ def check_effects(planned: EffectsRecorded, policy: Policy) -> None:
             f"Cannot use --effects-steps {planned.denoise_steps}; {policy.name} has {policy.num_denoise_steps} denoise "
             "steps."
         )
-    if "map" in planned.items and not isinstance(policy, MapPolicy):
-        raise BadArgument(
-            f"Cannot use --effects map with {policy.family}: its calls have no backward pass here; leave out map."
-        )
-    if "map" in planned.items and planned.denoise_steps < policy.num_denoise_steps:
-        raise BadArgument("Cannot use --effects-steps with --effects map: its order is of all denoise steps.")
+    check_map(planned, policy)
     for reader in planned.readers:
         if _READERS[reader][0] == "prefix" and not policy.has_prefix:
             raise BadArgument(
@@ -84,13 +80,16 @@ def effects_recorded(
     settings: EffectSettings, sites: Sequence[SiteLayout], denoise_steps: int, seed: int
 ) -> EffectsRecorded:
     """Return the effects of settings at these sites, with the selectors of the grouping's groups."""
-    items: list[EffectItems] = [item for item in get_args(EffectItems) if item in settings.items]
+    items: list[EffectItems] = [item for item in get_args(EffectItems) if item in settings.items and item != "map"]
     groups = {} if settings.grouping is None else _groups_of(settings.grouping, sites)
     items += ["groups"] if groups else []
     if settings.prompts and not settings.rows:
         raise BadArgument(f"Cannot use --prompts {settings.prompts} here, where no task is known yet; use a rerun.")
     items += ["prompts"] if settings.rows else []
-    return EffectsRecorded(tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows)
+    items += ["map"] if settings.map_form else []
+    return EffectsRecorded(
+        tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows, settings.blocks
+    )
 
 
 def describe_effects(planned: EffectsRecorded) -> str:
@@ -100,7 +99,8 @@ def describe_effects(planned: EffectsRecorded) -> str:
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)
     often = "every replan" if planned.every == 1 else f"one replan in {planned.every}"
-    parts = [f"{listing(items)}, {by}"] * bool(items) + ["patches, for all queries"] * ("map" in planned.items)
+    of_map = "patches, for all queries" if planned.blocks is None else "blocks of the pictures"
+    parts = [f"{listing(items)}, {by}"] * bool(items) + [of_map] * ("map" in planned.items)
     return f"Effects of {'; of '.join(parts)}; at {often} (docs/effects.md)."
 
 

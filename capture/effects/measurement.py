@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import UNCHANGED, conditions_of
 from vla_attention.capture.effects.mean_pictures import MeanPictures
-from vla_attention.capture.effects.patch_maps import DRAWN, PROJECTIONS, STRONGEST, PatchOrder, patch_order
+from vla_attention.capture.effects.patch_maps import DRAWN, PROJECTIONS, STRONGEST, CallMap, call_map, picture_blocks
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.factors import QueryWithoutKeys, SiteEditor
 from vla_attention.capture.interventions.resolution import (
@@ -94,11 +94,18 @@ class EffectMeasurement:
         """Choose how many calls are made at a time, by the memory that is left."""
         self._batch = calls_at_a_time(self.policy, self.say)
         if "map" in self.planned.items:
-            memory = format_bytes(cast(MapPolicy, self.policy).gradient_memory())
-            self.say(
-                f"Map: {PROJECTIONS} backward passes a policy call, which take about {memory} of memory, and exact "
-                f"calls without the strongest {STRONGEST:.0%} of the patches and {DRAWN} of the others."
-            )
+            self.say(self._price_of_map())
+
+    def _price_of_map(self) -> str:
+        blocks = self.planned.blocks
+        if blocks is not None:
+            number, how = len(picture_blocks(self.policy, blocks)), blocks.describe()
+            return f"Map: {plural(number, 'changed call')} a policy call; in each a block of the pictures is {how}."
+        memory = format_bytes(cast(MapPolicy, self.policy).gradient_memory())
+        return (
+            f"Map: {PROJECTIONS} backward passes a policy call, which take about {memory} of memory, and exact calls "
+            f"without the strongest {STRONGEST:.0%} of the patches and {DRAWN} of the others."
+        )
 
     def begin(self) -> EpisodeEffectsMeasured:
         """Return what measures one episode."""
@@ -263,10 +270,10 @@ class EpisodeEffectsMeasured:
             variant = self._variant(condition, policy_input, noise_seed, context, tokens, vocabularies)
             if variant is not None:
                 variants[number] = variant
-        order = self._order(policy_input, noise_seed, context, len(actions)) if "map" in planned.items else None
+        map_of = self._map(policy_input, noise_seed, context, len(actions)) if "map" in planned.items else None
         # Calls without a patch are numbered behind those of the conditions, and made together with them.
         behind = len(self.conditions)
-        patches = {} if order is None else order.variants(policy, policy_input, noise_seed)
+        patches = {} if map_of is None else map_of.variants(policy, policy_input, noise_seed)
         cut = {knockout.selector for number in variants for knockout in self.conditions[number].keys}
         for name, selector in planned.groups.items():
             if selector not in cut:
@@ -300,28 +307,27 @@ class EpisodeEffectsMeasured:
         self.run.seconds.append(time.perf_counter() - begun)
         if len(self.run.seconds) == 1 and self.run.says_seconds:
             calls = plural(len(variants) + len(patches), "changed call")
-            passes = "" if order is None else f" and {PROJECTIONS} backward passes"
+            passes = "" if map_of is None or planned.blocks else f" and {PROJECTIONS} backward passes"
             took = f"{calls}{passes} took {self.run.seconds[0]:.1f} s"
             self.run.say(f"Effects: {took} at the first policy call that is measured.")
         units = tuple(float(unit) for unit in self.run.units)
         silent = self.run.silent_blocks or ()
-        map_of = None if order is None else order.stored(policy, {} if refused else of_patch, actions.shape)
-        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent, map_of)
+        stored = None if map_of is None else map_of.stored(policy, {} if refused else of_patch, actions.shape)
+        return ReplanEffects(self.conditions, self.items, units, tuple(measured), change, weights, silent, stored)
 
-    def _order(
-        self, policy_input: PolicyInput, noise_seed: int, context: CallContext, horizon: int
-    ) -> PatchOrder | None:
-        policy, steps = self.run.policy, min(self.run.executed or self.run.policy.default_replan_steps, horizon)
+    def _map(self, policy_input: PolicyInput, noise_seed: int, context: CallContext, horizon: int) -> CallMap | None:
+        planned, policy = self.run.planned, self.run.policy
+        steps = min(self.run.executed or policy.default_replan_steps or horizon, horizon)
         seed = (self.run.planned.seed % 2**32, context.task_id, context.episode_index, context.replan)
         try:
-            order = patch_order(policy, policy_input, noise_seed, steps, horizon, seed)
+            found = call_map(planned, policy, policy_input, noise_seed, steps, horizon, seed)
         except torch.OutOfMemoryError:
             torch.cuda.empty_cache()
             self.run.say_once("The memory does not suffice for the backward passes of a call: no map is made.")
             return None
-        if order is None:
+        if found is None:
             self.run.say_once("The first order of the patches is NaN or infinite: no map is made of such calls.")
-        return order
+        return found
 
     def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
         pictures = self.run.pictures

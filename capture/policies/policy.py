@@ -237,18 +237,24 @@ class MapPolicy(VariantPolicy, Protocol):
     ) -> NDArray[np.float32]:
         """Return what cutting each patch as a whole changes of sums of a call's actions, (direction, patch) float32.
 
-        directions: the factors of the actions (direction, horizon, action dim), normalised. Patches are those of the
-        first site, in the order of `map_keys`.
+        directions: the factors of the actions (direction, horizon, action dim), normalised. Patches are those of
+        `map_keys`.
         """
 
     def gradient_memory(self) -> int:
         """Return the bytes that `patch_gradients` takes beside the model, about."""
 
 
+def map_site(policy: Policy) -> SiteLayout:
+    """Return the first of the policy's sites that has patches of pictures: maps of patches are of it."""
+    return next((site for site in policy.sites if site.pictured), policy.sites[0])
+
+
 def map_keys(policy: Policy) -> tuple[int, ...]:
-    """Return the keys of the patches of all cameras at the policy's first site."""
-    site = policy.sites[0]
-    return tuple(int(key) for camera in policy.cameras for key in site.patch_keys(camera.name))
+    """Return the keys of the patches of all cameras at the map's site."""
+    site = map_site(policy)
+    return tuple(int(key) for camera in policy.cameras if camera.name in site.pictured
+                 for key in site.patch_keys(camera.name))  # fmt: skip
 
 
 def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:

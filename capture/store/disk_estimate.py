@@ -130,9 +130,12 @@ def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[Si
     entries = len(effects.readers) * sum(counts.get(item, _MOST_ITEMS) for item in effects.items) + _MOST_ITEMS
     change = 4 * horizon * _ACTION_DIMENSIONS * _INCOMPRESSIBLE
     total = entries * (change + sum(site.num_keys for site in sites) / 8)
-    if "map" in effects.items:  # a number a patch, and the exact changes of up to a fifth of them
-        patches = sum(span.num_keys for span in sites[0].spans if span.grid is not None)
-        total += 4 * patches * _INCOMPRESSIBLE + (patches / 5 + _MOST_ITEMS) * change
+    if "map" in effects.items:  # a number a patch, and the exact changes of up to a fifth of them; or of all blocks
+        patches = max(sum(span.num_keys for span in site.spans if span.grid is not None) for site in sites)
+        blocks, exact = effects.blocks, patches / 5 + _MOST_ITEMS
+        if blocks is not None:
+            exact = max(len(site.pictured) for site in sites) * blocks.rows * blocks.columns
+        total += 4 * patches * _INCOMPRESSIBLE + exact * change
     return total / effects.every
 
 

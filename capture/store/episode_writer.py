@@ -260,6 +260,8 @@ class EpisodeWriter:
         earlier = first.effects  # a run that measures effects does so at the first replan
         if effects and effects.map and planned and "map" not in planned.items:
             yield "it has a map of patches, other than the run says"
+        if effects and effects.map and earlier and earlier.map and effects.map.form != earlier.map.form:
+            yield "its map is of other patches, or made in another way, than those of the replans before it"
         if effects and earlier and (effects.conditions, effects.units) != (earlier.conditions, earlier.units):
             yield "its effects are of other conditions, or in other units, than those of the replans before it"
 
@@ -379,16 +381,12 @@ class EpisodeWriter:
 
 def _map_of(maps: Sequence[tuple[int, ReplanMap]]) -> EffectMap:
     """What is said of the maps of some replans, which are of the same patches."""
-    first = maps[0][1]
-    return EffectMap(
-        first.site,
-        first.keys,
-        first.projections,
-        first.steps,
-        tuple(replan for replan, _ in maps),
-        tuple(replan for replan, of in maps for _ in of.patches),
-        tuple(patch for _, of in maps for patch in of.patches),
-        tuple(drawn for _, of in maps for drawn in of.drawn),
+    return structs.replace(
+        maps[0][1].form,
+        replan=tuple(replan for replan, _ in maps),
+        patch_replan=tuple(replan for replan, of in maps for _ in of.patches),
+        patch=tuple(patch for _, of in maps for patch in of.patches),
+        drawn=tuple(drawn for _, of in maps for drawn in of.drawn),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.effects import CHANGE, CUT, MAP, PATCH_CHANGE, EffectItem
+from vla_attention.schemas.effects import CHANGE, CUT, MAP, PATCH_CHANGE, EffectItem, EffectMap
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, EpisodeSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
@@ -54,14 +54,12 @@ class RecordedRows:
 class ReplanMap:
     """Which patches move the actions of one replan, see `EffectMap`.
 
-    site, keys, projections, steps: of the episode. sizes: (patch,) float32 by first order. patches: those of `change`
-    (entry, horizon, action dim) float32, in the units of the effects. drawn: which of them were drawn at random.
+    form: what is the same at all replans of an episode; it is of none yet. sizes: (block,) float32. patches: the blocks
+    of `change` (entry, horizon, action dim) float32, in the units of the effects. drawn: which of them were drawn at
+    random.
     """
 
-    site: str
-    keys: tuple[int, ...]
-    projections: int
-    steps: int
+    form: EffectMap
     sizes: NDArray[np.float32]
     patches: tuple[int, ...]
     drawn: tuple[bool, ...]
@@ -139,7 +137,7 @@ class ReplanRecord:
             arrays[CHANGE] = (self.effects.change, ("entry", "horizon", "action_dim"))
             arrays |= {f"{site}/{CUT}": (cut, ("entry", "key")) for site, cut in self.effects.cut.items()}
         if self.effects is not None and (map_of := self.effects.map) is not None:
-            arrays[MAP] = (map_of.sizes[None], ("map_row", "patch"))
+            arrays[MAP] = (map_of.sizes[None], ("map_row", "block"))
             arrays[PATCH_CHANGE] = (map_of.change, ("map_entry", "horizon", "action_dim"))
         return arrays
 

@@ -74,8 +74,11 @@ def effects_of_layout(effects: str | EffectSettings | None, layout: PolicyLayout
             f"Cannot measure effects with {settings.denoise_steps} denoise steps: a call of your own is repeated as it "
             "is. Leave denoise_steps out."
         )
-    if "map" in settings.items:
-        raise BadArgument("Cannot measure a map of patches of a call of your own, which has no backward pass here.")
+    if settings.map_form and (settings.blocks is None or settings.blocks.way == "picture"):
+        raise BadArgument(
+            f"Cannot measure '{settings.map_form}' of a call of your own, whose gradients and pictures are not known "
+            "here. Take map:8x8, which hides blocks of patches one at a time."
+        )
     tokens = [rule for rule in layout.rules if rule.tokens is not None]
     for reader in settings.readers:
         if reader == "action" or any(rule.is_prefix or reader == "all" for rule in tokens):
@@ -86,7 +89,10 @@ def effects_of_layout(effects: str | EffectSettings | None, layout: PolicyLayout
             f"are passes over {calls}, in which keys would be cut off too. Say it with CallRule(..., tokens=SITE), or "
             "use EffectSettings(..., readers=('action',)), as --effects-readers action."
         )
-    return effects_recorded(settings, [site.keys for site in layout.sites], layout.num_denoise_steps, _SEED)
+    planned = effects_recorded(settings, [site.keys for site in layout.sites], layout.num_denoise_steps, _SEED)
+    if planned.blocks and not any(site.keys.pictured for site in layout.sites):
+        raise BadArgument(f"Cannot measure a map: no key of the layout '{layout.name}' is a patch of a picture.")
+    return planned
 
 
 @dataclass(frozen=True)
@@ -131,7 +137,7 @@ class RepeatedPolicy:
         assert recording.effects is not None
         self.name, self.family = identity.name, identity.family
         self.num_denoise_steps = identity.num_denoise_steps
-        self.cameras = identity.cameras
+        self.cameras, self.default_replan_steps = identity.cameras, 0
         self.sites = tuple(site.keys for site in known.layout.sites)
         self.siblings: dict[int, Sequence[str]] = {}
         # It has what is needed of policies whose variants are made together.

@@ -339,9 +339,9 @@ def _cut_problems(block: Block) -> Iterator[str]:
 
 
 def _map_problems(block: Block) -> Iterator[str]:
-    """Sizes by first order (map_row, patch): 0 or more."""
+    """Sizes of a map (map_row, block): 0 or more."""
     outside = ~((block.values >= 0) & np.isfinite(block.values))
-    return block.faults("has the size {:.4g}; expected 0 or more,", outside, "map_row", "patch", found=block.values)
+    return block.faults("has the size {:.4g}; expected 0 or more,", outside, "map_row", "block", found=block.values)
 
 
 def _pose_problems(block: Block) -> Iterator[str]:
@@ -389,7 +389,7 @@ def effect_shapes(sites: Sequence[SiteLayout], entries: int, horizon: int, dims:
 
 def map_shapes(of: EffectMap, horizon: int, dims: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the arrays of a map of patches; `dims` is the number of dimensions of an action."""
-    return {MAP: (len(of.replan), len(of.keys)), PATCH_CHANGE: (len(of.patch), horizon, dims)}
+    return {MAP: (len(of.replan), of.num_blocks), PATCH_CHANGE: (len(of.patch), horizon, dims)}
 
 
 def shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> Iterator[str]:

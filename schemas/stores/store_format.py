@@ -19,7 +19,7 @@ NAME.zarr/                            attributes: `RootAttributes`
     camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32
     effects/change                    (entry, horizon, action_dim) float32; only where effects were measured
-    effects/map                       (map_row, patch) float32; only with a map of patches, as the next
+    effects/map                       (map_row, block) float32; only with a map of patches, as the next
     effects/patch_change              (map_entry, horizon, action_dim) float32
     joint/cut                         (entry, key) float32, the weight of each key that an effect is without
     steps/poses                       (moment, body, pose) float32; only where a simulator of ours ran the episode

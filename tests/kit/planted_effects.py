@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,8 +11,8 @@ import numpy as np
 from tests.kit.stores import PlantEffects
 from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.capture.interventions.condition_name import knockout_of_group
-from vla_attention.capture.store.replan_records import ReplanEffects
-from vla_attention.schemas.effects import EffectItem
+from vla_attention.capture.store.replan_records import ReplanEffects, ReplanMap
+from vla_attention.schemas.effects import EffectItem, EffectMap
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
@@ -104,3 +105,44 @@ def _effects_of(
     listed, items = (tuple(of) for of in list(zip(*all_of.values(), strict=True))[:2])
     change = np.array(changes, np.float32)
     return ReplanEffects(listed, items, (3.0,) * 7, tuple(measured), change, {"joint": cut})
+
+
+#: Patches of a planted map that are drawn at random.
+DRAWN = 4
+
+
+def planted_map(
+    task: int,
+    episode: int,
+    replan: int,
+    tokens: EpisodeTokens,
+    agrees: float = 1.0,
+    blocks: int = 0,
+    named: float = 1.0,
+    seed: int = 5,
+) -> ReplanEffects:
+    """Effects of words, and a map of the cameras with objects.
+
+    agrees: how far the order of a map by first order agrees with the sizes, up to 1. blocks: so many in place of it,
+    of patches in the order of their keys. named: how much larger sizes are where an object of interest is.
+    """
+    layout, generator = tokens.layout, np.random.default_rng([task, episode, replan, seed])
+    keys = tuple(int(key) for camera in tokens.coverage or () for key in layout.patch_keys(camera))
+    covered = np.concatenate(list((tokens.coverage or {}).values()), axis=1)[min(replan, tokens.num_replans - 1)]
+    of_interest = covered[:, [thing.of_interest for thing in tokens.objects]].sum(axis=1)
+    sizes = generator.uniform(0.1, 2.0, len(keys)) * (1 + (named - 1) * of_interest)
+    if blocks:
+        of_key = np.arange(len(keys)) * blocks // len(keys)
+        sizes = np.bincount(of_key, sizes) / np.bincount(of_key)
+        form = EffectMap("joint", keys, 0, 5, (), (), (), (), "hidden", tuple(map(int, of_key)))
+        first, chosen, drawn = sizes, range(blocks), (False,) * blocks
+    else:
+        form = EffectMap("joint", keys, 8, 5, (), (), (), ())
+        first = agrees * sizes + (1 - agrees) * generator.permutation(sizes)
+        number, order = round(0.15 * len(keys)), np.argsort(-first)
+        chosen = [*order[:number], *generator.permutation(order[number:])[:DRAWN]]
+        drawn = tuple(at >= number for at in range(len(chosen)))
+    change = np.stack([sizes[place] * np.ones((5, 7)) for place in chosen]).astype(np.float32)
+    of = planted_effects()(task, episode, replan, tokens)
+    one = ReplanMap(form, first.astype(np.float32), tuple(map(int, chosen)), drawn, change)
+    return replace(of, map=one)

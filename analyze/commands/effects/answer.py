@@ -106,11 +106,13 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
     otherwise, of_prompts = other_sentences(question, episodes, units, looks)
     if by:
         said = f"Below, a row for each item and {' and '.join(by)}."
-        if any(item.episode.attributes.effects.map for item in question.selected if item.episode.attributes.effects):
-            said += " Maps of patches are not divided: ask without --by."
+        _, maps = of_maps(question, units, by)
+        if maps and "time" in by:
+            said += " Maps of patches are not divided by time."
+        columns = [*looks, *columns_of_items(items, units)] if items.height else []
         return (
             [Finding(said, "What does the action depend on?")],
-            [Table("effects_items", items, [*looks, *columns_of_items(items, units)]), *of_prompts, *files],
+            [Table("effects_items", items, columns), *maps, *of_prompts, *files],
             [],
         )
     of_patches, maps = of_maps(question, units)

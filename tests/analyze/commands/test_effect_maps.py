@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,29 +10,11 @@ import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.kit.planted_effects import planted_effects
+from benchmarks.null_objects import FOLLOWS, rows_of, scenes_of, write
+from tests.kit.planted_effects import planted_effects, planted_map
 from tests.kit.stores import StoreSpec, write_store
-from vla_attention.capture.store.replan_records import ReplanEffects, ReplanMap
-from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.analyze.commands.effects.maps import ASKS, ASKS_NAMED
 from vla_attention.schemas.stores.reader import open_store
-
-DRAWN = 4
-
-
-def planted_map(task: int, episode: int, replan: int, tokens: EpisodeTokens, agrees: float = 1.0) -> ReplanEffects:
-    """Effects of words, and a map of the cameras with objects; the order agrees so far with the sizes."""
-    layout, generator = tokens.layout, np.random.default_rng([task, episode, replan, 5])
-    keys = tuple(int(key) for camera in tokens.coverage or () for key in layout.patch_keys(camera))
-    sizes = generator.uniform(0.1, 2.0, len(keys))
-    first = agrees * sizes + (1 - agrees) * generator.permutation(sizes)
-    number = round(0.15 * len(keys))
-    order = np.argsort(-first)
-    chosen = [*order[:number], *generator.permutation(order[number:])[:DRAWN]]
-    change = np.stack([sizes[place] * np.ones((5, 7)) for place in chosen]).astype(np.float32)
-    of = planted_effects()(task, episode, replan, tokens)
-    drawn = tuple(at >= number for at in range(len(chosen)))
-    one = ReplanMap("joint", keys, 8, 5, first.astype(np.float32), tuple(map(int, chosen)), drawn, change)
-    return replace(of, map=one)
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +47,13 @@ def test_parts_of_the_strongest_tenth_are_sums_over_its_patches(store):
             of_robot = sum(sizes[patch] * cover[number, patch, names.index("robot")] for patch in top) / whole
             parts.append((of_named, of_robot, 1 - of_named - of_robot))
         row = rows.filter(task_id=attributes.task_id, episode_index=attributes.episode_index).row(0, named=True)
-        assert [row["named"], row["robot"], row["other"]] == pytest.approx(np.mean(parts, axis=0), rel=1e-5)
+        assert [row[f"top_{name}"] for name in ("named", "robot", "other")] == pytest.approx(
+            np.mean(parts, axis=0), rel=1e-5
+        )
         assert row["rank"] == pytest.approx(1.0)
-    (finding,) = [one for one in findings if one.asks == "What in the picture moves the action?"]
-    of_tasks = rows.group_by("task_id").agg(pl.mean("named"))
-    assert finding.numbers["named"] == pytest.approx(of_tasks["named"].mean(), rel=1e-6)
+    (finding,) = [one for one in findings if one.asks == ASKS]
+    of_tasks = rows.group_by("task_id").agg(pl.mean("top_named"))
+    assert finding.numbers["named"] == pytest.approx(of_tasks["top_named"].mean(), rel=1e-6)
     patches = tables["maps"].shown
     assert patches.height == 18 * len(open_store(store).episodes[0].attributes.effects.map.keys)
     assert patches["exact"].drop_nulls().len() == sum(
@@ -82,12 +66,10 @@ def sorted_cameras(episode) -> list[str]:
 
 
 def test_an_order_that_chance_could_give_is_said_not_to_hold(tmp_path):
-    def plant(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
-        return planted_map(task, episode, replan, tokens, agrees=0.0)
-
+    plant = partial(planted_map, agrees=0.0)
     spec = StoreSpec(tasks=(0, 1), episodes=3, replans=3, plant_effects=plant, effect_items=("text", "map"))
     _, findings = tables_of(write_store(tmp_path / "a.zarr", spec=spec))
-    (finding,) = [one for one in findings if one.asks == "What in the picture moves the action?"]
+    (finding,) = [one for one in findings if one.asks == ASKS]
     assert finding.numbers["rank_low"] < 0.5
     assert "not shown to hold" in finding.limit
 
@@ -95,8 +77,86 @@ def test_an_order_that_chance_could_give_is_said_not_to_hold(tmp_path):
 def test_one_episode_does_not_say_that_the_order_holds(tmp_path):
     spec = StoreSpec(tasks=(0,), episodes=1, replans=3, plant_effects=planted_map, effect_items=("text", "map"))
     _, findings = tables_of(write_store(tmp_path / "a.zarr", spec=spec))
-    (finding,) = [one for one in findings if one.asks == "What in the picture moves the action?"]
+    (finding,) = [one for one in findings if one.asks == ASKS]
     assert "too few episodes" in finding.limit
+
+
+@pytest.fixture(scope="module")
+def blocks(tmp_path_factory) -> Path:
+    plant, success = partial(planted_map, blocks=6), lambda task, episode: episode > 0
+    spec = StoreSpec(tasks=(0, 1), episodes=3, replans=3, plant_effects=plant, effect_items=("text", "map"),
+                     plant_success=success)  # fmt: skip
+    return write_store(tmp_path_factory.mktemp("blocks") / "a.zarr", spec=spec)
+
+
+def test_parts_of_blocks_are_sums_over_all_of_them(blocks):
+    tables, findings = tables_of(blocks)
+    rows = tables["maps_episodes"].shown
+    for opened in open_store(blocks).episodes:
+        attributes, sums = opened.attributes, []
+        one, change = attributes.effects.map, opened.read("effects/patch_change").astype(float)
+        named = [thing.of_interest for thing in attributes.objects]
+        cover = np.concatenate([opened.read(f"objects/{camera}") for camera in sorted_cameras(opened)], axis=1)
+        attention = opened.read("joint/rows").astype(float).mean(axis=(1, 2, 3, 4))
+        for number, replan in enumerate(one.replan):
+            sizes = {one.patch[i]: abs(change[i]).mean() for i, at in enumerate(one.patch_replan) if at == replan}
+            of_key = cover[number][:, named].sum(axis=1)
+            covers = {block: of_key[np.array(one.blocks) == block].mean() for block in sizes}
+            read = {block: sum(attention[replan, key] for key, own in zip(one.keys, one.blocks, strict=True)
+                               if own == block) for block in sizes}  # fmt: skip
+            sums.append([sum(of[block] * covers[block] for block in of) / sum(of.values()) for of in (sizes, read)])
+        row = rows.filter(task_id=attributes.task_id, episode_index=attributes.episode_index).row(0, named=True)
+        found = [row["all_named"], row["attention_all_named"]]
+        assert found == pytest.approx(np.mean(sums, axis=0), rel=1e-4)
+        assert row["rank"] is None
+    (finding,) = [one for one in findings if one.asks == ASKS]
+    assert finding.numbers["named"] == pytest.approx(
+        rows.group_by("task_id").agg(pl.mean("all_named"))["all_named"].mean()
+    )
+    of_outcome = tables["maps_outcomes"].shown
+    solved = rows.filter("success").group_by("task_id").agg(pl.mean("all_named"))["all_named"].mean()
+    assert of_outcome.filter("success")["all_named"].item() == pytest.approx(solved)
+
+
+def test_parts_are_kept_apart_by_task(blocks):
+    tables, _ = tables_of(blocks, by="task")
+    rows, each = tables["maps_by"].shown, tables["maps_episodes"].shown
+    assert rows["task_id"].to_list() == [0, 1]
+    for task in (0, 1):
+        mean = each.filter(task_id=task)["all_other"].mean()
+        assert rows.filter(task_id=task)["all_other"].item() == pytest.approx(mean)
+
+
+def test_compare_has_the_parts_of_both_runs(blocks, tmp_path):
+    spec = StoreSpec(tasks=(0, 1), episodes=3, replans=3, effect_items=("text", "map"), seed=0,
+                     plant_effects=partial(planted_map, blocks=6, seed=1))  # fmt: skip
+    result = va.open(blocks).compare(write_store(tmp_path / "b.zarr", spec=spec))
+    row = (
+        {table.name: table for table in result.tables}["maps"]
+        .shown.filter(scope="all", item="named")
+        .row(0, named=True)
+    )
+    for side, path in (("first", blocks), ("other", tmp_path / "b.zarr")):
+        each = tables_of(path)[0]["maps_episodes"].shown
+        mean = each.group_by("task_id").agg(pl.mean("all_named"))["all_named"].mean()
+        assert row[f"mean_{side}"] == pytest.approx(mean)
+
+
+@pytest.mark.parametrize("times", [8.0, 0.1])
+def test_what_is_named_is_compared_as_attention_to_it_is(tmp_path, times):
+    """Each patch moves the action as much as it is attended to: both answers have the same numbers."""
+    root, scenes = scenes_of(va.example("cubes"))
+    rows = [rows_of(scene, root, FOLLOWS["uniform"], 0, times) for scene in scenes]
+    path = write(tmp_path / "a.zarr", root, scenes, rows, maps=True)
+    result = va.open(path).objects(iou=False)
+    by_asks = {finding.asks: finding.numbers for finding in result.findings}
+    moves, read = by_asks[ASKS_NAMED], by_asks["What does it look at?"]
+    assert [moves[name] for name in _NAMED] == pytest.approx([read[name] for name in _NAMED], rel=2e-3)
+    assert moves["shown"] == 1
+    assert (moves["ratio"] > 1) == (times > 1)
+
+
+_NAMED = ("ratio", "ratio_low", "ratio_high")
 
 
 def test_stores_without_a_map_say_nothing_of_it(tmp_path):

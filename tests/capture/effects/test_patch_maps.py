@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,18 @@ import pytest
 import torch
 import zarr
 
-from tests.capture.effects.test_measurement import call_of, measurement
+from tests.capture.effects.test_measurement import by_hand, call_of, measurement
 from tests.capture.effects.test_recorded_effects import adds_alone, damaged
 from tests.capture.interventions.test_interventions_on_policies import policy_named
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
 from vla_attention.capture.__main__ import main
-from vla_attention.capture.effects.patch_maps import DRAWN, STRONGEST
+from vla_attention.capture.effects.arguments import EffectSettings
+from vla_attention.capture.effects.patch_maps import DRAWN, STRONGEST, without_block
 from vla_attention.capture.torch_policies.repeated_calls import effects_of_layout
+from vla_attention.schemas.effects import MapBlocks
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -94,12 +98,80 @@ def test_fewer_denoise_steps_have_no_map():
         measurement(policy_named("pi05"), items=("map",), denoise_steps=1)
 
 
-def test_policies_without_a_backward_pass_have_none(tmp_path, capsys):
+def test_policies_without_a_backward_pass_have_blocks_only(tmp_path, capsys):
     with pytest.raises(AssertionError):
         capture(tmp_path / "cosmos.zarr", "cosmos", "--effects", "map")
-    assert "--effects map" in capsys.readouterr().err
-    with pytest.raises(BadArgument, match="map"):
-        effects_of_layout("map", None)
+    assert "map:4x4" in capsys.readouterr().err
+    for form in ("map", "map:picture:2x2"):
+        with pytest.raises(BadArgument, match="map:8x8"):
+            effects_of_layout(form, None)
+
+
+@pytest.mark.parametrize("name", ["pi05", "pi0", "cosmos"])
+def test_a_block_is_hidden_as_a_knockout_of_its_patches_hides_it(name):
+    policy = policy_named(name)
+    given, context, actions = call_of(policy)
+    run = measurement(policy, ("map:2x2",))
+    one = run.begin().measure(given, 11, actions, context).map
+    assert len(run.lines) == 1
+    of_block = {}
+    for key, block in zip(one.form.keys, one.form.blocks, strict=True):
+        of_block.setdefault(block, []).append(key)
+    assert one.patches == tuple(sorted(of_block))
+    assert one.form.num_blocks == 4 * len(policy.cameras) == len(one.sizes)
+    site = next(site for site in policy.sites if site.name == one.form.site)
+    middle = site.patch_keys(policy.cameras[0].name)
+    side = round(len(middle) ** 0.5)
+    assert of_block[1] == middle.reshape(side, side)[: side // 2, side // 2 :].ravel().tolist()
+    for place, change in zip(one.patches, one.change, strict=True):
+        selector = " | ".join(f"keys:{key}-{key}" for key in of_block[place])
+        condition = Interventions(keys=(KeyKnockout(selector, queries="all"),))
+        expected = by_hand(policy, condition, given, context) - actions
+        np.testing.assert_allclose(change * run.units, expected, atol=1e-5)
+        steps = change[: one.form.steps].astype(float)
+        assert one.sizes[place] == pytest.approx(np.sqrt((steps**2).mean()), rel=1e-5)
+    assert np.abs(one.change).max() > 1e-4
+    assert not any(one.drawn)
+
+
+@pytest.mark.parametrize("name", ["pi05", "cosmos"])
+def test_a_block_of_the_picture_is_filled_from_around(name):
+    policy = policy_named(name)
+    given, context, actions = call_of(policy)
+    run = measurement(policy, ("map:picture:2x1",))
+    one = run.begin().measure(given, 11, actions, context).map
+    assert (one.form.way, one.form.reader) == ("picture", "")
+    camera = policy.cameras[0].name
+    picture = given.given.frames[camera]
+    changed = without_block(picture, (1, 0), MapBlocks("picture", 2, 1))
+    rows, columns = (np.flatnonzero((changed != picture).any(axis=axes)) for axes in ((1, 2), (0, 2)))
+    height, width = picture.shape[:2]
+    assert (rows[0], rows[-1], columns[0], columns[-1]) == (height // 2, height - 1, 0, width - 1)
+    assert changed.min() >= picture.min()
+    frames = {**given.given.frames, camera: changed}
+    own = {name: one for name, one in given.given.camera_frames.items() if name != camera}
+    again = policy.prepare_again(replace(given.given, frames=frames, camera_frames=own))
+    expected = policy.act(again, 11) - actions
+    np.testing.assert_allclose(one.change[one.patches.index(1)] * run.units, expected, atol=1e-5)
+    assert np.abs(expected).max() > 1e-5
+
+
+def test_blocks_smaller_than_patches_are_the_patches():
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    one = measurement(policy, ("map:50x50",)).begin().measure(given, 11, actions, context).map
+    assert sorted(one.form.blocks) == list(range(len(one.form.keys)))
+
+
+def test_blocks_of_a_picture_without_a_patch_are_refused():
+    with pytest.raises(BadArgument, match="50 x 50"):
+        measurement(policy_named("pi05"), ("map:picture:50x50",))
+
+
+@pytest.mark.parametrize("words", ["map:1x1", "map:0x4", "map:8", "map,map:4x4", "map:picture"])
+def test_maps_that_are_none_are_refused(words):
+    with pytest.raises(BadArgument):
+        EffectSettings(tuple(words.split(",")))
 
 
 def test_verify_finds_maps_that_do_not_fit(mapped, tmp_path):

@@ -264,6 +264,19 @@ def test_groups_of_a_grouping(tmp_path):
     assert not any("group_linguistic" in name for name in found)  # it is the item 'linguistic'
 
 
+@pytest.mark.parametrize("readers", [("all", "action"), ("action",)])
+def test_a_map_hides_blocks_of_patches_as_a_group_hides_them(tmp_path, readers):
+    selector = "patch:front[0:1,0:2]"
+    (tmp_path / "top.toml").write_text(f'[groups]\ntop = "{selector}"\nrest = "*"\n')
+    settings = va.EffectSettings((f"grouping:{tmp_path / 'top.toml'}", "map:2x1"), readers)
+    store, _, _ = fill(tmp_path / "a.zarr", SamplingPolicy(), effects=settings)
+    one, change = store.episodes[0].attributes.effects.map, store.episodes[0].read("effects/patch_change")
+    assert (one.way, one.reader, one.patch[:2]) == ("hidden", readers[0], (0, 1))
+    suffix = "_queries_all" if readers[0] == "all" else ""
+    np.testing.assert_allclose(change[0], changes_of(store)[f"without_group_top{suffix}"], atol=1e-6)
+    assert np.abs(change[0]).max() > 1e-3
+
+
 def test_objects_are_cut_by_the_share_that_they_cover(tmp_path, monkeypatch):
     policy = SamplingPolicy()
     share = np.array([[0.25, 0.75], [1, 0], [0, 1], [0, 1]], dtype=np.float32)
