@@ -207,9 +207,9 @@ class OpenStores:
         """What the action depends on, as far as the run recorded it (`vla-attention capture --effects`).
 
         Tables "effects_items", "effects_summary", "effects_episodes", "effects" (every replan, condition and reader),
-        "effects_time"; with a map of patches "maps_episodes", "maps_summary", "maps"; of a replayed data set
-        "deviation", "deviation_dimensions", "deviation_attention", "deviation_replans". `by`: keep apart task, family,
-        episode, replan or time.
+        "effects_time"; with a map of patches "maps_episodes", "maps_by", "maps_outcomes", "maps_summary",
+        "maps_naming", "maps"; of a replayed data set "deviation", "deviation_dimensions", "deviation_attention",
+        "deviation_replans". `by`: keep apart task, family, episode, replan or time.
 
         >>> rows = va.open(with_effects).effects()["effects"]
         >>> rows.filter(label="all pictures", reader="total").select("task_id", "replan").rows()[:2]

@@ -14,6 +14,7 @@ In a null store every key's attention is the same in expectation; tasks, episode
     language  what is done has nothing to do with what is told (rollouts without attention: seconds)
     language_test  policies whose actions scatter, drift or round, whatever they are told (calls: seconds)
     effects   the action changes as much without each word, part and picture as with another noise seed
+    map_order the order of a map by first order has nothing to do with the exact sizes of the patches drawn at random
 
 A planted store differs in one place: the attention to the pictures, to the word "the", or of the second run, is higher,
 by `FACTOR` or a power of it. `null_objects.py` has the nulls of `objects`.
@@ -28,6 +29,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,10 +40,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import vla_attention as va
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
-from tests.kit.planted_effects import planted_effects
+from tests.kit.planted_effects import planted_effects, planted_map
 from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.core.listening import IN_PART, LISTENS_TO_ALL, listens
+from vla_attention.analyze.core.patch_maps import TRUSTED
 from vla_attention.analyze.statistics.many_looks import SHOWN_AT
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
@@ -289,12 +292,25 @@ def named_by_effects(number: int, planted: float, folder: Path, tasks: int = 6, 
     return named
 
 
+def order_is_shown(number: int, planted: bool, folder: Path) -> bool:
+    """Whether `effects` says that the order of a map by first order is shown to hold.
+
+    In a null store it is drawn. In a planted one it is nine parts the sizes and one part another order of them.
+    """
+    plant = partial(planted_map, agrees=0.9 * planted, seed=number)
+    spec = StoreSpec(tasks=(0, 1, 2), episodes=3, replans=3, layers=(0,), heads=(0,), frames=False, seed=number,
+                     effect_items=("text", "map"), plant_effects=plant)  # fmt: skip
+    found = va.open(write_store(folder / "a.zarr", spec=spec)).effects()
+    return any(float(finding.numbers.get("rank_low") or 0.0) >= TRUSTED for finding in found.findings)
+
+
 def main() -> None:
     """Print a line per command."""
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    kinds = ["analyze", "outcome", "time", "words", "words here", "compare", "language", "language_test", "effects"]
+    kinds = ["analyze", "outcome", "time", "words", "words here", "compare", "language", "language_test", "effects",
+             "map_order"]  # fmt: skip
     parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"
@@ -326,7 +342,8 @@ def main() -> None:
         named = 0
         for number in range(arguments.stores):
             with tempfile.TemporaryDirectory() as folder:
-                named += names_something(kind, number, arguments.planted, Path(folder))
+                ask = order_is_shown if kind == "map_order" else partial(names_something, kind)
+                named += ask(number, arguments.planted, Path(folder))
         print(f"  {kind:8} names something in {named:4d} ({100 * named / arguments.stores:.1f} %)", flush=True)
 
 
