@@ -15,6 +15,7 @@ from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import Compared, RunValues, by_themselves, compared
 from vla_attention.analyze.core.listening import IN_PART, listens, whatever
 from vla_attention.analyze.core.pairs import PAIR
+from vla_attention.analyze.core.patch_maps import any_map
 from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
@@ -237,6 +238,8 @@ def _needs(part: Compared) -> list[Finding]:
         said.append(f"{100 * row['difference']:+.0f} points of what patches do to the action lie on {on[row['item']]}")
     text = "; ".join(said) if said else "no item's effect is shown to differ"
     limit = "Trust exchanged words more than missing ones: a sentence with a missing word is new to the policy."
+    if "maps" not in part.rows and all(any_map(run.run.question) for run in (part.first, part.other)):
+        limit += " Maps are not compared: they were not made in the same way, or none has the objects."
     return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers, limit)]
 
 
