@@ -87,7 +87,8 @@ class EffectsRecorded(Document, frozen=True):
 
     `every`: at every so many replans, from the first on. `denoise_steps`: network evaluations of a changed call.
     `seed`: of the random keys, and of the other noise. `groups`: the selector of each group, by name. `prompts`: the
-    prompt table. `blocks`: of the map; None for one by first order.
+    prompt table. `blocks`: of the map; None for one by first order. `controls`: whether items are kept alone, and as
+    many random keys are cut.
     """
 
     items: tuple[EffectItems, ...]
@@ -98,6 +99,7 @@ class EffectsRecorded(Document, frozen=True):
     groups: dict[str, str] = field(default_factory=dict)
     prompts: tuple[OtherPrompt, ...] = ()
     blocks: MapBlocks | None = None
+    controls: bool = True
 
     def __post_init__(self) -> None:
         """Check that something is measured, and the numbers."""

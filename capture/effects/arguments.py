@@ -52,6 +52,12 @@ class EffectSettings:
         name="effects-steps",
         least=1,
     )
+    controls: bool = option(
+        "also each group, all text and all pictures alone, and as many random tokens (default: yes; without them a "
+        "grouping takes a third of the calls)",
+        True,
+        name="effects-controls",
+    )
     pictures: StorePlace | None = option(
         "exchange a camera's picture for the mean of the task's pictures in this store (default: for a grey one; in a "
         "rerun: the store that is run again)",

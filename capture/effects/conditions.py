@@ -88,8 +88,9 @@ def effects_recorded(
     items += ["prompts"] if settings.rows else []
     items += ["map"] if settings.map_form else []
     return EffectsRecorded(
-        tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows, settings.blocks
-    )
+        tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows, settings.blocks,
+        settings.controls,
+    )  # fmt: skip
 
 
 def describe_effects(planned: EffectsRecorded) -> str:
@@ -136,7 +137,7 @@ def conditions_of(
         # A group of a grouping may be one of the other items: it is measured once.
         known = groups.setdefault(group.selector, group)
         groups[group.selector] = dataclasses.replace(known, alone=known.alone or group.alone)
-    controlled = _controlled(planned, words)
+    controlled = _controlled(planned, words) if planned.controls else []
     # Calls that are made one by one are the same to the bit: only a batch needs the unchanged one among them.
     conditions = [(UNCHANGED, EffectItem("nothing"))] if isinstance(policy, VariantPolicy) else []
     conditions.append((Interventions("noise", noise=NoiseChange(planned.seed)), EffectItem("noise")))
@@ -146,7 +147,7 @@ def conditions_of(
             knockout = KeyKnockout(selector, queries=queries, query_selector=query_selector)
             item = EffectItem("without", group.kind, group.item, reader=reader)
             conditions.append((knockout_of_group("without", group.name, knockout), item))
-            if group.alone and queries != "prefix":
+            if group.alone and planned.controls and queries != "prefix":
                 alone = knockout_of_group("only", group.name, replace(knockout, keep=True))
                 conditions.append((alone, replace(item, change="only")))
         for selector in controlled:

@@ -107,6 +107,19 @@ def test_every_effect_is_that_of_a_single_call(name):
     assert {"prompt_synonyms_red_blue", "prompt_synonyms_bowl_cup", "prompt_synonyms_plate_stove"} <= set(names)
 
 
+def test_without_controls_nothing_is_kept_alone_and_no_random_keys_are_cut():
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    kinds = {}
+    for controls in (True, False):
+        run = measurement(policy, ("text", "cameras", "grouping:default"), controls=controls)
+        effects = run.begin().measure(given, 11, actions, context)
+        kinds[controls] = {condition.name for condition in effects.conditions}
+    left_out = {name for name in kinds[True] if name.startswith(("only_", "random_"))}
+    assert left_out
+    assert kinds[False] == kinds[True] - left_out
+
+
 def test_what_is_cut_is_stored_for_each_entry():
     policy = policy_named("pi05")
     given, context, actions = call_of(policy)
