@@ -44,6 +44,7 @@ class Call:
         task: its number.
         exact, other: of every single patch, with the call's own noise and with another seed's.
         blocks: of blocks of four patches, the block's size in each of its patches.
+        filled: of every patch's part of the picture, filled from its surroundings.
         attention: of the action queries.
         columns: the Jacobian by patch (output, patch), of a small weight and of whole patches.
         named, robot: the part of each patch that what the sentence names covers, and the robot.
@@ -54,6 +55,7 @@ class Call:
     exact: Any
     other: Any
     blocks: Any
+    filled: Any
     attention: Any
     columns: Mapping[bool, Any]
     named: Any
@@ -103,6 +105,24 @@ class Maker:
             factors[keys] = 0.0
             editor = SiteEditor(self.site.name, [SiteEdit("patches", "factor", factors, "all")])
             variants.append(CallVariant(given, seed, {self.site.name: editor}))
+        return self._changes(variants)
+
+    def filled(self, given: Any, seed: int) -> Any:
+        """The same with every patch's part of the picture filled from its surroundings."""
+        from vla_attention.capture.effects.patch_maps import CallMap, picture_blocks
+        from vla_attention.capture.policies.policy import CallVariant
+        from vla_attention.schemas.effects import MapBlocks
+
+        (side,) = {round(len(keys) ** 0.5) for _, keys in self.grids}
+        planned = MapBlocks("picture", side, side)
+        blocks = picture_blocks(self.policy, planned)
+        made = CallMap(blocks, planned, dict.fromkeys(range(len(blocks)), False), None, self.steps, "all")
+        variants = made.variants(self.policy, given, seed)
+        return self._changes([CallVariant(given, seed, {}), *(variants[i] for i in range(len(blocks)))])
+
+    def _changes(self, variants: list[Any]) -> Any:
+        import numpy as np
+
         made = np.stack(self.policy.act_variants(variants, self.model.config.num_denoise_steps, 64))
         change = ((made[1:] - made[:1]) / self.policy.action_units())[:, : self.steps]
         return np.sqrt((change**2).mean(axis=(1, 2)))
@@ -152,6 +172,7 @@ def measured_calls(place: str, tasks: int, number: int) -> Iterator[Call]:
             maker.sizes(given, seed, maker.single),
             maker.sizes(given, seed + 1, maker.single),
             np.array([of_patch[key] for key in maker.patches]),
+            maker.filled(given, seed),
             rows[maker.patches],
             {whole: maker.gradients(given, seed, whole) for whole in (False, True)},
             cover[:, [i for i, name in enumerate(names) if name in shown.named]].sum(axis=1),
@@ -168,6 +189,7 @@ def costs(maker: Maker, given: Any, seed: int) -> dict[str, float]:
     calls: dict[str, Callable[[], object]] = {
         "exact": lambda: maker.sizes(given, seed, maker.single),
         "blocks": lambda: maker.sizes(given, seed, maker.blocks),
+        "filled": lambda: maker.filled(given, seed),
         "few": lambda: maker.sizes(given, seed, few),
         "16": lambda: maker.gradients(given, seed, True, 16),
         "8": lambda: maker.gradients(given, seed, True, 8),
@@ -240,6 +262,7 @@ def map_table(calls: list[Call], draws: int) -> Table:
         row("exact, one patch at a time", "exact", lambda call, _: call.exact),
         row("the same with another noise seed", "", lambda call, _: call.other),
         row("exact, blocks of four patches", "blocks", lambda call, _: call.blocks),
+        row("each patch filled from its surroundings in the picture", "filled", lambda call, _: call.filled),
         row("attention of the action queries", "", lambda call, _: call.attention),
     ]
     for whole, form in ((False, "a small weight"), (True, "whole patches")):
