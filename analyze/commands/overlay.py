@@ -64,7 +64,7 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
             cameras: Sequence[str] | None = None, outline: Sequence[str] = (), smooth: bool = False,
             video: Literal["gif", "mp4"] | None = None, fps: float = 4.0, num_episodes: int = 2,
             num_replans: int = 8) -> Result:  # fmt: skip
-    """Pictures of some episodes with the attention on them, all on one scale.
+    """Pictures of some episodes with the attention on them, on one scale; below, what moves the action, where known.
 
     Args:
         question: stores, selection and grouping, whose ratio stands above the pictures.

@@ -48,7 +48,7 @@ def with_rows_of_moves(frame: pl.DataFrame, moves: EpisodeMoves, units: ActionUn
             "second": lift.tolist(),
             "marks": [mark[:2] for mark in marks],
             "above": f"step {one['step']}",
-            "below": "no map of this call" if at is None else _strongest(lift, marks, units),
+            "below": _strongest(lift, marks, units),
         }
         rows += [read, moved]
     numbers = pl.List(pl.List(pl.Float64))
@@ -59,6 +59,8 @@ def with_rows_of_moves(frame: pl.DataFrame, moves: EpisodeMoves, units: ActionUn
 
 def _strongest(lift: NDArray[np.float64], marks: Sequence[tuple[float, float, float]], units: ActionUnits) -> str:
     """Of a picture: where the map is highest, and the largest exact change."""
+    if not np.isfinite(lift).any():
+        return "no map of this call"
     row, column = np.unravel_index(int(np.nan_to_num(lift).argmax()), lift.shape)
     said = f"highest {float(f'{lift[row, column]:.2g}'):g}, {place_in(int(row), int(column), lift.shape)}"
     return f"{said}\nexact: up to {units.short(max(size for *_, size in marks))}" if marks else said

@@ -111,7 +111,8 @@ def episode_moves(item: SelectedEpisode, cameras: Sequence[str], units: ActionUn
     seen = roles[np.minimum(one.replan, len(roles) - 1)][:, keys] == Role.IMAGE
     sizes = _exact(item, one, np.array(effects.units), units)
     with np.errstate(divide="ignore", invalid="ignore"):
-        lifts = values / np.nanmean(np.where(seen, values, np.nan), axis=1, keepdims=True)
+        mean = np.nanmean(np.where(seen, values, np.nan), axis=1, keepdims=True)
+        lifts = np.where(mean > 0, values / mean, 0.0)  # where no patch does anything, none does more than others
         of_keys = {}
         for name, array in {"lift": np.where(seen, lifts, 0.0), "seen": seen, "size": sizes}.items():
             of_keys[name] = np.full((len(values), layout.num_keys), np.nan if name == "size" else 0.0)
