@@ -162,7 +162,9 @@ def pictures(figure: Figure, style: Style) -> Canvas:
     for segments, (color, points, _) in zip(around, looks, strict=True):
         _draw_lines(axes, segments, color, points)
     if marked:
-        axes.plot(*zip(*marked, strict=True), "s", ms=_MARK, color=_SECOND, mec="white", mew=0.5, zorder=3)
+        cells = max(len(one["second"][0]) for one, _ in shown if one.get("second") is not None)
+        size = min(_MARK, 0.36 * 72 * side / cells)  # a picture of many patches is still seen
+        axes.plot(*zip(*marked, strict=True), "s", ms=size, color=_SECOND, mec="white", mew=0.18 * size, zorder=3)
     for number, key in enumerate(keys):
         _draw_legend(axes, key, (0.08, height - sum(bands[number:]) + bands[number] / 2), width)
     return canvas
