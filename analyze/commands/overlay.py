@@ -11,6 +11,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.commands.overlay_maps import (
+    caption_of_moves,
+    how_drawn,
+    of_both,
+    place_in,
+    units_of_maps,
+    with_rows_of_moves,
+)
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.camera_maps import (
     EpisodeMaps,
@@ -25,6 +33,7 @@ from vla_attention.analyze.core.camera_maps import (
     upright,
 )
 from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.map_pictures import episode_moves, with_moves
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import check_replan, find_episode
@@ -38,7 +47,6 @@ from vla_attention.schemas.safe_text import file_part, visible
 _TINY = float(np.finfo(float).tiny)
 #: A group's patches are those of which it takes at least this share.
 _OUTLINE_WEIGHT = 0.5
-_PLACES = (("top", "middle", "bottom"), ("left", "centre", "right"))
 _COLUMNS = (
     Column("task_id", "count", "task"),
     Column("episode_index", "count", "episode"),
@@ -56,7 +64,7 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
             cameras: Sequence[str] | None = None, outline: Sequence[str] = (), smooth: bool = False,
             video: Literal["gif", "mp4"] | None = None, fps: float = 4.0, num_episodes: int = 2,
             num_replans: int = 8) -> Result:  # fmt: skip
-    """Pictures of some episodes with the attention on them, all on one scale.
+    """Pictures of some episodes with the attention on them, on one scale; below, what moves the action, where known.
 
     Args:
         question: stores, selection and grouping, whose ratio stands above the pictures.
@@ -82,6 +90,8 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
     )
     of_chosen = replace(question, selected=tuple(chosen))
     every = [episode_maps(question, item, names) for item in chosen]
+    units = units_of_maps(question, chosen)
+    moved = [None if units is None else episode_moves(item, names, units) for item in chosen]
     ratios = _ratios(of_chosen)
     shown = [_chosen_replans(maps, replans, num_replans) for maps in every]
     # Of all their policy calls, so that lines mean the same in a strip, in a film and on the page.
@@ -90,21 +100,31 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
     of_words = np.array([lift for maps in every for line in maps.words for _, lift in line])
     options = {"high": high, "levels": levels, "smooth": smooth, "outlines": list(groups.names) if groups else [],
                "words_high": scale_end(of_words)}  # fmt: skip
+    if units is not None:
+        options["second"] = how_drawn([moves for moves in moved if moves is not None])
     figures, files, parts = [], {}, []
-    for maps, which in zip(every, shown, strict=True):
+    for maps, moves, which in zip(every, moved, shown, strict=True):
         frame = _frame(maps, range(len(maps.env_step)), ratios, groups)
         parts.append(frame)
-        figure = _figure(question, maps, frame.filter(pl.col("replan").is_in(list(which))), options, levels)
+        own = options if moves is not None else {**options, "second": None}
+        if moves is not None and units is not None:
+            frame = with_rows_of_moves(frame, moves, units)
+        figure = _figure(question, maps, frame.filter(pl.col("replan").is_in(list(which))), own, levels)
         figures.append(figure)
         if video:
-            film = _figure(question, maps, frame, options, levels)
+            film = _figure(question, maps, frame, own, levels)
             files[f"{figure.name}.{video}"] = partial(write_film, figure=film, fps=fps, kind=video)
     of_shown = [part.filter(pl.col("replan").is_in(list(which))) for part, which in zip(parts, shown, strict=True)]
     table = pl.concat(of_shown).select(*_KEPT)
     held = [column for column in _COLUMNS if table[column.name].null_count() < table.height]
-    patches = pl.concat(patch_table(maps, which) for maps, which in zip(every, shown, strict=True))
+    of_patches = [patch_table(maps, which) for maps, which in zip(every, shown, strict=True)]
+    findings = [_finding(question, every[0], table)]
+    if units is not None:
+        of_patches = [with_moves(rows, moves) for rows, moves in zip(of_patches, moved, strict=True)]
+        findings += of_both(question, every, moved, shown)
+    patches = pl.concat(of_patches)
     return Result(
-        "Where it looks", about(question), [_finding(question, every[0], table)],
+        "Where it looks", about(question), findings,
         [Table("overlay", table, held, "Pictures"), Table("overlay_patches", patches)],
         figures, [*notes(question), *orientation_notes(every)], files,
     )  # fmt: skip
@@ -163,7 +183,7 @@ def _frame(
             share = float((one.mass[replan].sum() + one.outside[replan]) / max(maps.image_mass[replan], _TINY))
             ratio = known.get(replan)
             step = int(starts[replan])
-            place = _place(int(row), int(column), lift.shape)
+            place = place_in(int(row), int(column), lift.shape)
             cells = None if members is None else one.picture.highest(members[min(replan, len(members) - 1)])
             rows.append({
                 **identity, "replan": replan, "env_step": int(maps.env_step[replan]), "step": step, "camera": camera,
@@ -184,13 +204,6 @@ _TYPES: dict[str, Any] = {
     "object": pl.String, "ratio": pl.Float64, "members": pl.List(pl.List(pl.List(pl.Boolean))),
     "map": pl.List(pl.List(pl.Float64)), "words": pl.List(pl.String), "lifts": pl.List(pl.Float64),
 }  # fmt: skip
-
-
-def _place(row: int, column: int, shape: tuple[int, ...]) -> str:
-    vertical, horizontal = (
-        part[int(3 * (at + 0.5) / side)] for part, at, side in zip(_PLACES, (row, column), shape, strict=True)
-    )
-    return f"{vertical} {horizontal}"
 
 
 def _object(maps: EpisodeMaps, camera: str, covering: NDArray[np.float32], replan: int) -> str:
@@ -230,6 +243,7 @@ def _figure(
         f"its colour is kept (all of it from {options['high']:g} times on); lines: at {lines} times. Words: the darker,"
         " the more attention per token."
     )
+    caption += caption_of_moves(options.get("second"))
     return Figure(name, "pictures", frame, _named(maps), caption, {**options, "picture": partial(_picture, read=read)})
 
 

@@ -8,12 +8,15 @@ Columns of the frame, a row for each picture:
     row, column   where it stands: its row of pictures, and its place in it. A row that is text is named on the left.
     above, below  text, with line breaks where it has them; may be missing.
     map           the value of every patch, (row, column) as lists, the right way up; null or missing without one.
+    second        the same of another quantity, with lines of its own colour; may be missing. Without `map` it is lit.
+    marks         patches that are marked, (patch, 2): x and y in parts of the picture; may be missing.
     members       for each of the option `outlines`, whether it takes the patch, (group, row, column); may be missing.
     words, lifts  the words of the instruction, and the value of each; may be missing.
 
 Options: picture, a function of a row of the frame that gives its picture (row, column, 3) uint8, or None where there is
 none; high, the value from which on pictures are as bright as they get (`even` gives 1); levels, the values at which
-lines are drawn, at most two; outlines, names of groups; smooth, whether values change smoothly between patches;
+lines are drawn, at most two; second, the same of `second`, with how its lines and its marks are called: a mapping of
+high, levels, unit and marked; outlines, names of groups; smooth, whether values change smoothly between patches;
 words_high, as high, of the words; sentences, for whose words there is room.
 """
 
@@ -49,8 +52,14 @@ _KEPT, _COLOUR_KEPT, _GREY = 0.5, 0.55, 165.0
 _BLUE = (0.0, 58.0, 112.0)
 #: Points of the two lines, each dark with a light border; of lines around groups, their colours.
 _LINES = (1.0, 2.2)
+#: Of a second quantity: its lines, and the points of its marks. Black lines and blue ones are told apart by everybody.
+_SECOND, _MARK = "#0072B2", 2.8
 _OUTLINES = ("#00B5CC", "#E040A0", "#7A5CFF", "#5CB800")
 _WORD = "#E69F00"
+#: In a legend: what is pale; and inches of a letter.
+_PALE, _LEGEND_LETTER = "#A0A0A0", 0.053
+#: A colour, the points of a line or 0, and what it says.
+Look = tuple[str, float, str]
 #: Ends of a line (x0, y0, x1, y1).
 Segment = tuple[float, float, float, float]
 
@@ -86,7 +95,8 @@ def pictures(figure: Figure, style: Style) -> Canvas:
     frame = figure.frame
     rows, columns = (frame[name].unique(maintain_order=True).to_list() for name in ("row", "column"))
     across, named = min(len(columns), _COLUMNS), frame.schema["row"] == pl.String
-    margin = 0.08 + 0.2 * named
+    names = {row: wrapped(row, 22, 2) for row in rows if named}
+    margin = 0.08 + 0.2 * named + 0.12 * any("\n" in name for name in names.values())
     # As wide as a plot, unless the texts at the pictures would touch.
     wide = (style.width(wide=False) - margin) / across < _LEAST
     side = min((style.width(wide) - margin) / across - _GAP, _LARGEST)
@@ -96,16 +106,31 @@ def pictures(figure: Figure, style: Style) -> Canvas:
         broken = ["\n".join(wrapped(line, int(_LETTERS * side), 3) for line in text) for text in texts]
         heights_of[name] = _LINE * max(text.count("\n") + bool(text) for text in broken)
         frame = frame.with_columns(pl.Series(name, broken))
-    shown = [(one, *_lit(one, o)) for one in frame.iter_rows(named=True)]
-    heights = {row: max(side * len(at) / len(at[0]) for one, at, _ in shown if one["row"] == row) for row in rows}
+    shown = [(one, _lit(one, o)) for one in frame.iter_rows(named=True)]
+    heights = {row: max(side * len(at) / len(at[0]) for one, at in shown if one["row"] == row) for row in rows}
     above, below = heights_of.values()
     high = sum(heights.values()) + len(rows) * (above + below + 0.14)
     top = 0.06 if style.paper else _BAND
-    width, has_map = max(margin + across * (side + _GAP), 3.3), any(values is not None for *_, values in shown)
+    width, has_map = max(margin + across * (side + _GAP), 3.3), any(one.get("map") is not None for one, _ in shown)
+    second: Mapping[str, Any] = o.get("second") or {}
     said = _lines(_words(frame), width)
     others = [_lines([(word, 0.0) for word in words], width) for words in o.get("sentences", ())]
     start = top + _BAND * max(map(len, [said, *others]))
-    height = start + high * -(-len(columns) // _COLUMNS) + (_BAND if has_map else 0.0)
+    lines, looks = [], []
+    for name, color, unit, of in (("map", "black", "even", o), ("second", _SECOND, second.get("unit"), second)):
+        for level, points in zip(of.get("levels", ()), _LINES, strict=False):
+            lines.append((name, level))
+            looks.append((color, points, f"{level:g} times {unit} or more"))
+    own = len(o.get("levels", ()))
+    outlines = [wrapped(name, 30, 1) for name in o.get("outlines", ())]
+    looks += [(_OUTLINES[i % len(_OUTLINES)], 1.4, name) for i, name in enumerate(outlines)]
+    legends = [("even", [*looks[:own], *looks[len(lines) :]])] * has_map
+    if second:
+        marks = [(_SECOND, 0.0, second["marked"])] if second.get("marked") else []
+        legends.append((second["unit"], [*looks[own : len(lines)], *marks]))
+    keys = [[(_PALE, 0.0, f"pale: no more than {unit}"), *of_unit] for unit, of_unit in legends]
+    bands = [_BAND + _LINE * (-(-len(key) // _legend_columns(key, width)) - 1) for key in keys]
+    height = start + high * -(-len(columns) // _COLUMNS) + sum(bands)
     canvas = style.canvas(width, height)
     axes = canvas.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     axes.set_axis_off()
@@ -113,13 +138,9 @@ def pictures(figure: Figure, style: Style) -> Canvas:
         axes.text(0.08, 0.07, wrapped(figure.title, int(13 * width), 1), va="top", size=10)
     for number, of_line in enumerate(said):
         _draw_words(axes, of_line, float(o.get("words_high", 4.0)), top + _BAND * (number + 0.5))
-    levels = list(o.get("levels", ()))
-    looks = [("black", points, f"{level:g} times even or more") for level, points in zip(levels, _LINES, strict=False)]
-    looks += [
-        (_OUTLINES[i % len(_OUTLINES)], 1.4, wrapped(name, 30, 1)) for i, name in enumerate(o.get("outlines", ()))
-    ]
     around: list[list[Segment]] = [[] for _ in looks]
-    for one, picture, values in shown:
+    marked: list[tuple[float, float]] = []
+    for one, picture in shown:
         line, place = divmod(columns.index(one["column"]), _COLUMNS)
         before = rows[: rows.index(one["row"])]
         x = margin + place * (side + _GAP)
@@ -131,27 +152,37 @@ def pictures(figure: Figure, style: Style) -> Canvas:
         if one.get("below"):
             axes.text(x + side / 2, y + down + 0.03, one["below"], ha="center", va="top", size=7)
         if named and place == 0:
-            name = wrapped(one["row"], 22, 2)
-            axes.text(x - 0.04, y + down / 2, name, ha="right", va="center", size=7.5, rotation=90)
-        regions: list[NDArray[np.bool_] | None] = [None if values is None else values >= level for level in levels]
+            axes.text(x - 0.04, y + down / 2, names[one["row"]], ha="right", va="center", size=7.5, rotation=90)
+        regions = [None if one.get(name) is None else _array(one[name]) >= level for name, level in lines]
         regions += [np.array(member, dtype=bool) for member in one.get("members") or ()]
         for number, region in enumerate(regions):
             if region is not None:
-                around[number] += borders(region, 0.12 * (number >= len(levels)), (x, y), (side, down))
+                around[number] += borders(region, 0.12 * (number >= len(lines)), (x, y), (side, down))
+        marked += [(x + side * across, y + down * below) for across, below in one.get("marks") or ()]
     for segments, (color, points, _) in zip(around, looks, strict=True):
         _draw_lines(axes, segments, color, points)
-    if has_map:
-        _draw_legend(axes, looks, (0.08, height - _BAND / 2), width)
+    if marked:
+        cells = max(len(one["second"][0]) for one, _ in shown if one.get("second") is not None)
+        size = min(_MARK, 0.36 * 72 * side / cells)  # a picture of many patches is still seen
+        axes.plot(*zip(*marked, strict=True), "s", ms=size, color=_SECOND, mec="white", mew=0.18 * size, zorder=3)
+    for number, key in enumerate(keys):
+        _draw_legend(axes, key, (0.08, height - sum(bands[number:]) + bands[number] / 2), width)
     return canvas
 
 
-def _lit(one: Mapping[str, Any], o: Mapping[str, Any]) -> tuple[NDArray[np.uint8], NDArray[np.float64] | None]:
-    """A picture as it is shown, and the values of its patches."""
-    picture = o["picture"](one)
-    if one.get("map") is None:
-        return picture, None
-    values = np.array(one["map"], dtype=np.float64)
-    return lit(picture, values, o["high"], bool(o.get("smooth"))), values
+def _array(values: Any) -> NDArray[np.float64]:
+    return np.array(values, dtype=np.float64)
+
+
+def _lit(one: Mapping[str, Any], o: Mapping[str, Any]) -> NDArray[np.uint8]:
+    """A picture as it is shown; grey where no value of its map is known: if pale, all of them would seem to be low."""
+    picture: NDArray[np.uint8] = o["picture"](one)
+    for name, of in (("map", o), ("second", o.get("second") or {})):
+        if one.get(name) is not None:
+            values = _array(one[name])
+            known = np.isfinite(values).any()
+            return lit(picture if known else None, values, of["high"], bool(o.get("smooth")))
+    return picture
 
 
 def borders(
@@ -230,15 +261,31 @@ def _draw_words(axes: Axes, words: Sequence[tuple[str, float]], high: float, dow
                                bbox=box)  # fmt: skip
 
 
-def _draw_legend(axes: Axes, looks: Sequence[tuple[str, float, str]], place: tuple[float, float], width: float) -> None:
+def _legend_columns(key: Sequence[Look], width: float) -> int:
+    """In how many columns a legend fits into a picture of so many inches; 1 if it does not."""
+    for columns in (4, 2):
+        parts = np.array_split([0.45 + _LEGEND_LETTER * len(label) for *_, label in key], columns)
+        if sum(part.max(initial=0.0) for part in parts) < width:
+            return columns
+    return 1
+
+
+def _draw_legend(axes: Axes, key: Sequence[Look], place: tuple[float, float], width: float) -> None:
+    from matplotlib.legend import Legend
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.patheffects import withStroke
 
-    handles: list[Artist] = [Patch(facecolor="#A0A0A0", label="pale: no more than even")]
-    for color, points, label in looks:
+    handles: list[Artist] = []
+    for color, points, label in key:
+        if color == _PALE:
+            handles.append(Patch(facecolor=color, label=label))
+            continue
         effect = [withStroke(linewidth=points + 1.2, foreground="white")]
-        handles.append(Line2D([], [], color=color, linewidth=points, path_effects=effect, label=label))
-    columns = 4 if width > 5 or len(handles) < 3 else 2
-    axes.legend(handles=handles, loc="center left", ncols=columns, bbox_to_anchor=place, borderaxespad=0.0,
-                bbox_transform=axes.transData, handlelength=1.6, columnspacing=1.2, fontsize=7.5)  # fmt: skip
+        mark = "" if points else "s"
+        handles.append(Line2D([], [], color=color, linewidth=points, path_effects=effect, label=label, marker=mark,
+                              ms=2 * _MARK, mec="white"))  # fmt: skip
+    names = [label for *_, label in key]
+    axes.add_artist(Legend(axes, handles, names, loc="center left", ncols=_legend_columns(key, width),
+                           bbox_to_anchor=place, bbox_transform=axes.transData, borderaxespad=0.0, handlelength=1.6,
+                           columnspacing=1.2, fontsize=7.5))  # fmt: skip

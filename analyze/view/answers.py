@@ -30,6 +30,7 @@ from typing import Any, TypeAlias
 
 from vla_attention.analyze.core.action_changes import ActionUnits, units_of
 from vla_attention.analyze.core.camera_maps import seen_cameras
+from vla_attention.analyze.core.map_pictures import has_map
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, npy
 from vla_attention.analyze.view.head_answers import heads_of_run
 from vla_attention.analyze.view.paths import RUNS, NothingThere
@@ -96,6 +97,8 @@ class Answers:
                     return shown.film(query.get("site", [None])[0], layer, head, denoise), "image/gif"
             case ["pictures", camera, file]:
                 return shown.picture(camera, _number(file, ".png")), PNG
+            case [site, "moves.json"] if site in [known.name for known in shown.store.attributes.sites]:
+                return _json(shown.moves(site, self._units_of(served.store)))
             case [site, *of_site] if site in [known.name for known in shown.store.attributes.sites]:
                 return _of_site(shown, site, of_site, query)
         raise NothingThere
@@ -160,6 +163,8 @@ def _addresses(shown: ShownEpisode, heads: bool) -> Iterator[str]:
                 f"{site.name}/{kind}/{layer}.npy" for kind in ("rows", "uniform", *(["heads"] if heads else []))
             )
         yield f"{site.name}/objects.json"
+        if has_map(shown.item(site.name)):
+            yield f"{site.name}/moves.json"
         yield from (f"{site.name}/grid/{number}.json" for number in range(len(shown.targets(site.name))))
         for step, head in product((MEAN, *axes.denoise_steps), (MEAN, *(axes.heads if heads else ()))):
             yield f"{site.name}/groups/{step}/{head}.json"

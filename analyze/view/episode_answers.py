@@ -25,7 +25,9 @@ from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.action_changes import EFFECT, GRIPPER, ActionUnits
 from vla_attention.analyze.core.camera_maps import (
     PictureMap,
+    line_levels,
     map_note,
+    scale_end,
     seen_cameras,
     shared_out,
     stored_picture,
@@ -33,6 +35,7 @@ from vla_attention.analyze.core.camera_maps import (
     view_of,
 )
 from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.map_pictures import HOW, episode_moves, has_map, shown_lift
 from vla_attention.analyze.core.measure import Measured, look_at, means
 from vla_attention.analyze.core.naming import told_things
 from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects, selected_items
@@ -174,6 +177,7 @@ class ShownEpisode:
         return {
             "cameras": {camera: _camera(item, camera) for camera in seen_cameras(item)},
             "targets": self.targets(site),
+            "moves": has_map(item),
             "prompts": [
                 {
                     "text": visible(prompt.text),
@@ -237,6 +241,37 @@ class ShownEpisode:
             found[camera] = {name: of_replans for name, of_replans in shown.items() if any(of_replans)}
         self._covered[site] = found
         return found
+
+    def moves(self, site: str, units: ActionUnits) -> dict[str, Any] | None:
+        """`moves.json`: which patches move the action, at the calls that have a map; None without any.
+
+        lift: by camera (map row, cell), times the mean patch of the call. exact: by camera and map row the patches that
+        were taken away exactly: where their centres are, in parts of the picture, in which cell, and what that does in
+        words, in `units` of the whole store. how: what the map is. marked: whether these patches are marked.
+        """
+        found = episode_moves(self.item(site), seen_cameras(self.item(site)), units)
+        if found is None:
+            return None
+        cameras = {}
+        for camera, one in found.cameras.items():
+            (rows, columns), places = one.lift.shape[1:], range(len(found.replan))
+            cameras[camera] = {
+                "lift": _numbers(np.array([shown_lift(one, at).ravel() for at in places])),
+                "exact": [
+                    [
+                        {"x": x, "y": y, "cell": int(y * rows) * columns + int(x * columns), "said": units.size(size)}
+                        for x, y, size in one.marks(at)
+                    ]
+                    for at in places
+                ],
+            }
+        return {
+            "replans": list(found.replan),
+            "levels": line_levels(scale_end(found.lifts)),
+            "how": HOW[found.way],
+            "marked": found.marked,
+            "cameras": cameras,
+        }
 
     def rows(self, site: str, layer: str, heads: bool = False) -> Array:
         """Rows of a layer, or of the mean of all: (replan, denoise, key), mean over heads and queries.

@@ -8,7 +8,10 @@ layers, denoise steps and heads, the same as on the page. Entities:
     about                      what happened, and what the numbers are
     pictures/CAMERA            what the policy got, as a person sees the scene; below it the lines around the patches
                                that get so many times even attention, pictures/CAMERA/2 times even, and the outlines of
-                               objects that the sentence names or that were touched, pictures/CAMERA/objects/NAME
+                               objects that the sentence names or that were touched, pictures/CAMERA/objects/NAME; where
+                               there are maps of what moves the action, lines around the patches that are first in them,
+                               pictures/CAMERA/moves the action/2 times the mean, and the patches that were taken away
+                               exactly, each with what that does, pictures/CAMERA/moves the action/exact
     words                      the instruction with attention and effect of every word, as a table
     ratio, masses, attention   by replan: the ratio and what even attention gives; mass of groups; times even of words
     heads/most                 by replan: which head looks most at the named object, or at what is first on the page
@@ -42,6 +45,8 @@ from vla_attention.analyze.core.camera_maps import (
     seen_cameras,
     upright,
 )
+from vla_attention.analyze.core.map_pictures import HOW, EpisodeMoves, episode_moves, shown_lift
+from vla_attention.analyze.core.patch_maps import map_of
 from vla_attention.analyze.render.files import replacing, writing
 from vla_attention.analyze.render.pictures import borders
 from vla_attention.analyze.render.style import group_styles
@@ -66,12 +71,18 @@ OLDEST = (0, 24)
 #: negative numbers.
 _LINES = ((0x00, 0xB5, 0xCC), (0xE0, 0x40, 0xA0))
 _WIDE = 1.2
+#: Of lines and marks of what moves the action; the second lines are wider.
+_MOVES = (0x00, 0x72, 0xB2)
 #: By object what Rerun knows of it: its number, label and colour.
 Classes: TypeAlias = dict[str, tuple[int, str, tuple[int, int, int]]]
 #: Colours of objects, on the page too: named in the sentence, touched, others.
 _NAMED, _TOUCHED, _OTHER = (0x00, 0xC0, 0x8B), (0xFF, 0x6A, 0x1F), (0x99, 0x99, 0x99)
 #: Curves that others are held against, and their colour, which light and dark viewers show.
 _BASELINES, _BASELINE_COLOR = ("spread evenly", "another noise seed"), "#8F8F8F"
+_ABOUT_MOVES = (
+    " *Blue lines*: what moves the action ({}), so many times the mean patch of the call. *Blue points*: patches that "
+    "were taken away exactly, where not all were; point at one."
+)
 #: An action in a simulator of ours.
 _ACTIONS = ("x", "y", "z", "turn x", "turn y", "turn z", "gripper")
 #: Lengths of the hand's axes in metres, and of half an object's mark.
@@ -162,8 +173,12 @@ def logged(
     sites = [site.name for site in shown.store.attributes.sites]
     for site in sites:
         before = (site,) if len(sites) > 1 else ()
-        maps = episode_maps(shown.question(site), shown.item(site), seen_cameras(shown.item(site)))
+        cameras = seen_cameras(shown.item(site))
+        maps = episode_maps(shown.question(site), shown.item(site), cameras)
         yield from _pictures(before, shown, maps, classes, starts)
+        moves = None if units is None else episode_moves(shown.item(site), cameras, units)
+        if moves is not None and units is not None:
+            yield from _moves(before, moves, units, starts)
         yield from _words(before, maps, effects, starts)
         yield from _groups(before, shown.groups(site, MEAN, MEAN), starts)
         for target in about["sites"][site]["targets"][:1]:
@@ -232,6 +247,11 @@ def _about(shown: ShownEpisode, about: Mapping[str, Any], units: ActionUnits | N
         "action queries, mean over layers, denoise steps and heads. *Times even*: what a word or patch gets, divided "
         "by what it would get if attention were spread evenly."
         + (" *Outlines*: green, what the sentence names; orange, what was touched." if about["objects"] else "")
+        + (
+            ""
+            if (one := map_of(shown.item(shown.store.attributes.sites[0].name))) is None
+            else _ABOUT_MOVES.format(HOW[one.way])
+        )
         + ("" if units is None else f" *Effect*: without the item, {units.said('so much')} ({units.title}).")
     )
 
@@ -300,6 +320,34 @@ def _pictures(
                 # Rerun would write the name at each strip.
                 lines = {"strips": strips, "class_ids": [classes[name][0]], "radii": -_WIDE, "show_labels": False}
                 yield Logged((*place, "objects", _spelled(name)), "LineStrips2D", lines, step)
+
+
+def _moves(before: tuple[str, ...], moves: EpisodeMoves, units: ActionUnits, starts: Sequence[int]) -> Iterator[Logged]:
+    """Lines around the patches that are first in the maps of what moves the action, and exact patches; else nothing."""
+    levels = line_levels(scale_end(moves.lifts))
+    for camera, one in moves.cameras.items():
+        place, grid = (*before, "pictures", camera, "moves the action"), one.picture.grids[0]
+        sides = float(grid.image_width), float(grid.image_height)
+        for replan, step in enumerate(starts):
+            at = moves.row(replan)
+            for number, level in enumerate(levels, 1):
+                around = [] if at is None else borders(shown_lift(one, at) >= level, 0.1, (0.0, 0.0), sides)
+                strips = [(one[:2], one[2:]) for one in around]
+                lines = {"strips": strips, "colors": [_MOVES], "radii": -_WIDE * number}
+                yield Logged((*place, f"{level:g} times the mean"), "LineStrips2D", lines, step)
+            marks = one.marks(at) if at is not None and moves.marked else []
+            yield Logged(
+                (*place, "exact"),
+                "Points2D",
+                {
+                    "positions": [(x * sides[0], y * sides[1]) for x, y, _ in marks],
+                    "labels": [f"without it {units.size(size)}" for *_, size in marks],
+                    "colors": [_MOVES],
+                    "radii": -2 * _WIDE,
+                    "show_labels": False,
+                },
+                step,
+            )
 
 
 def _words(

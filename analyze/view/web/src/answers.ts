@@ -99,6 +99,8 @@ export interface Word {
 export interface SiteLayout {
   readonly cameras: Readonly<Record<string, CameraLayout>>;
   readonly prompts: readonly { text: string; words: readonly Word[] }[];
+  /** Whether there are maps of which patches move the action. */
+  readonly moves: boolean;
   /** What heads may look at. */
   readonly targets: readonly { name: string; selector: string }[];
 }
@@ -205,6 +207,18 @@ export interface Effects {
   readonly parts: readonly EffectPart[];
   readonly items: readonly Effect[];
   readonly notes: readonly string[];
+}
+
+/** Which patches move the action, at some calls, on a scale of its own: lift (map row, cell), times the mean patch. What
+ * single ones do was measured: their centres in parts of the picture, and the effect in words. Marked: whether by squares. */
+export interface Moves {
+  readonly replans: readonly number[];
+  readonly levels: readonly number[];
+  readonly how: string;
+  readonly marked: boolean;
+  readonly cameras: Readonly<
+    Record<string, { lift: Grid; exact: readonly (readonly { x: number; y: number; cell: number; said: string }[])[] }>
+  >;
 }
 
 /** Cells of the maps that an object covers: camera -> object -> replan -> cells. */

@@ -10,7 +10,8 @@ const read = (scene: Scene) =>
   answered<Effects | null>(() => {
     const { value: about } = scene.about.value;
     if (!about?.effects || about.name !== scene.name.value) return null;
-    return readJson<Effects | null>(`${address.episode(scene.run.value, scene.name.value)}/effects.json`);
+    const known = readJson<Effects | null>(`${address.episode(scene.run.value, scene.name.value)}/effects.json`);
+    return known.then((all) => (triedOf(all).size ? all : null)); // a run of maps alone tried nothing by name
   });
 export const effects = read(main);
 const besideEffects = read(beside);

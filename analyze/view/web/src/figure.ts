@@ -1,8 +1,7 @@
 /** The pictures of a call as a figure of its own, drawn from what is shown and not from how a browser shows it. */
 import { address, readPicture } from "./answers";
-import { type Kind, levels, linesOf, meaning, STROKES } from "./pictures";
-import { denoise, fullNameOf, head, layer, type Side, sides, site } from "./state";
-import { outline } from "./sums";
+import { capOf, isDrawn, type Kind, levels, linesOf, meaning, STROKES, sampleOf } from "./pictures";
+import { denoise, fullNameOf, head, layer, main, type Side, sides, site } from "./state";
 
 /** Pixels: the width of a picture, between things, of a line of text, and of a letter of it, about. */
 const [PICTURE, GAP, LINE, LETTER] = [320, 12, 18, 6.9];
@@ -27,7 +26,7 @@ const strokes = (kind: Kind, path: string): string =>
   STROKES[kind]
     .map(
       ([stroke, width, dash]) =>
-        `<path d="${path}" fill="none" stroke="${stroke}" stroke-width="${width}"${dash ? ` stroke-dasharray="${dash}"` : ""}/>`,
+        `<path d="${path}" fill="none" stroke="${stroke}" stroke-linecap="${capOf(kind)}" stroke-width="${width}"${dash ? ` stroke-dasharray="${dash}"` : ""}/>`,
     )
     .join("");
 
@@ -66,7 +65,7 @@ async function drawnSide(side: Side): Promise<Drawn> {
       const tall = Math.round((PICTURE * how.height) / how.width);
       high = Math.max(high, tall);
       const cell = [PICTURE / how.columns, tall / how.rows] as const;
-      const lines = linesOf({ scene, camera, how, at }).map(({ kind, inside }) => strokes(kind, outline(how, inside, cell)));
+      const lines = linesOf({ scene, camera, how, at }).map(({ kind, path }) => strokes(kind, path(cell)));
       const below = how.stored
         ? `<image width="${PICTURE}" height="${tall}" preserveAspectRatio="none" href="${await asData(await readPicture(address.picture(scene.run.value, scene.name.value, camera, at)))}"/>`
         : `<rect width="${PICTURE}" height="${tall}" fill="#cdcdcd"/>`;
@@ -93,7 +92,7 @@ export async function figure(): Promise<Drawn> {
     if (at > GAP && at + room > width) [at, y] = [GAP, y + LINE];
     parts.push(
       `<rect x="${at}" y="${y - 9}" width="24" height="9" fill="#8a8f96"/>`,
-      strokes(kind, `M${at + 2} ${y - 4.5}H${at + 22}`),
+      strokes(kind, sampleOf(kind, at + 2, y - 4.5)),
       written(meaning(kind), at + 30, y),
     );
     at += room;
@@ -104,7 +103,7 @@ export async function figure(): Promise<Drawn> {
     ["head", head.value],
     ["denoise step", denoise.value],
   ].map(([name, one]) => (one === "mean" ? `mean of ${name}s` : `${name} ${one}`));
-  const settings = `Attention of the action queries: ${chosen.join(", ")}. Lines go around patches that get ${levels.value.join(" and ")} times what an even spread would give.`;
+  const settings = `Attention of the action queries: ${chosen.join(", ")}.${isDrawn(main, "read") ? ` Lines go around patches that get ${levels.value.join(" and ")} times what an even spread would give.` : ""}${meaning("moves") ? " Blue lines: how far the action changes without a patch, by first order, on a scale of its own." : ""}`;
   for (const line of wrapped(settings, width - 2 * GAP)) {
     y += LINE;
     parts.push(written(line, GAP, y));

@@ -18,9 +18,11 @@ import {
   massesOf,
   numReplans,
   OTHER_SITE,
+  part,
   picked,
   type Scene,
   setPart,
+  sides,
   toggled,
   uniformAt,
 } from "./state";
@@ -64,44 +66,100 @@ export const STROKES = {
   named: [["#00c08b", 2.4, "5 4"]],
   touched: [["#ff6a1f", 2.4, "5 4"]],
   picked: [["#56b4e9", 3, ""]],
+  moves: [
+    ["#fff", 4, ""],
+    ["#0072b2", 2, ""],
+  ],
+  most: [
+    ["#fff", 6, ""],
+    ["#0072b2", 3.8, ""],
+  ],
+  exact: [
+    ["#fff", 6, ""],
+    ["#0072b2", 4, ""],
+  ],
 } as const;
 export type Kind = keyof typeof STROKES;
+/** Lines without a length are squares. */
+export const capOf = (kind: Kind): "square" | "butt" => (kind === "exact" ? "square" : "butt");
+
+const LINES = { read: "what is read", moves: "what moves the action", both: "both" } as const;
+
+/** Whether an episode's lines are drawn: around what is read, or around what moves the action, where there is a map. */
+export const isDrawn = (scene: Scene, what: "read" | "moves"): boolean =>
+  scene.layout.value?.moves ? ![what === "read" ? "moves" : "read"].includes(part("lines")) : what === "read";
+
+/** A map of what moves the action, with the levels of its lines; null where the call has none, or none is drawn. */
+function movesAt(scene: Scene, camera: string, at: number) {
+  const [known, row] = [scene.moves.value.value, scene.moves.value.value?.replans.indexOf(at) ?? -1];
+  const own = known?.cameras[camera];
+  if (!own || row < 0 || !isDrawn(scene, "moves")) return null;
+  const { levels } = main.moves.value.value ?? known;
+  return { lift: own.lift[row]!, exact: own.exact[row]!, marked: known.marked, levels };
+}
+
+function meaningsOfMoves(): { moves: string; most: string; exact: string } {
+  const known = isDrawn(main, "moves") ? main.moves.value.value : null;
+  const [least, most] = known?.levels ?? [];
+  return {
+    moves: least ? `moves the action: ${least} times the mean patch` : "",
+    most: most ? `${most} times` : "",
+    exact: known?.marked ? "exact call without it" : "",
+  };
+}
 
 /** What a kind of lines says; empty where none of it can be there. */
 export const meaning = (kind: Kind): string =>
   ({
-    first: `${FIRST} times an even spread`,
-    second: levels.value[1] ? `${levels.value[1]} times` : "",
+    first: isDrawn(main, "read") ? `${FIRST} times an even spread` : "",
+    second: isDrawn(main, "read") && levels.value[1] ? `${levels.value[1]} times` : "",
     named: about.value.value?.objects.length && covered.value.value ? "named in the sentence" : "",
     touched: about.value.value?.objects.length && covered.value.value ? "touched" : "",
     picked: "",
+    ...meaningsOfMoves(),
   })[kind];
 
-/** The lines of a picture: their kind, the cells that they go around, and of an object its name. */
-export function linesOf({ scene, camera, how, at }: At): { kind: Kind; inside: (cell: number) => boolean; title: string }[] {
+/** Lines of a picture: their kind, their path for cells of a size, and of an object its name. */
+export interface Line {
+  readonly kind: Kind;
+  readonly path: (size?: readonly [number, number]) => string;
+  readonly title: string;
+}
+
+export function linesOf({ scene, camera, how, at }: At): Line[] {
+  const around = (kind: Kind, inside: (cell: number) => boolean, title = "", by = 0): Line => ({
+    kind,
+    path: (size) => outline(how, inside, size, by),
+    title,
+  });
   const [mass, even] = [massesOf(scene, at), evenOf(scene, at)];
-  const lifts = mass && even ? cellLifts(mass, even, how) : null;
+  const lifts = mass && even && isDrawn(scene, "read") ? cellLifts(mass, even, how) : null;
+  const moved = movesAt(scene, camera, at);
   const episode = scene.about.value.value;
   const touched = new Set(episode?.events.map(({ thing }) => thing));
   const things = (episode?.objects ?? [])
     .filter(({ named, name }) => named || touched.has(name))
     .flatMap(({ name, shown: title, named }) => {
       const cells = new Set(scene.covered.value.value?.[camera]?.[name]?.[at] ?? []);
-      return cells.size
-        ? [{ kind: named ? ("named" as const) : ("touched" as const), inside: (cell: number) => cells.has(cell), title }]
-        : [];
+      return cells.size ? [around(named ? "named" : "touched", (cell) => cells.has(cell), title)] : [];
     });
   const own = new Set(cellsOf(scene, camera));
   return [
-    ...(lifts
-      ? levels.value.map((level, i) => ({
-          kind: i ? ("second" as const) : ("first" as const),
-          inside: (cell: number) => lifts[cell]! >= level,
-          title: "",
-        }))
-      : []),
+    ...(lifts ? levels.value.map((level, i) => around(i ? "second" : "first", (cell) => lifts[cell]! >= level)) : []),
+    // Within the patches, so that both lines are seen where they go around the same ones.
+    ...(moved?.levels.map((level, i) => around(i ? "most" : "moves", (cell) => (moved.lift[cell] ?? 0) >= level, "", 0.12)) ?? []),
     ...things,
-    ...(own.size ? [{ kind: "picked" as const, inside: (cell: number) => own.has(cell), title: "" }] : []),
+    ...(moved?.marked && moved.exact.length
+      ? [
+          {
+            kind: "exact" as const,
+            path: ([wide, high]: readonly [number, number] = [1, 1]) =>
+              moved.exact.map(({ x, y }) => `M${x * how.columns * wide} ${y * how.rows * high}h0`).join(""),
+            title: "",
+          },
+        ]
+      : []),
+    ...(own.size ? [around("picked", (cell) => own.has(cell))] : []),
   ];
 }
 
@@ -109,7 +167,7 @@ export function Strokes({ kind, path, title }: { kind: Kind; path: string; title
   return (
     <g class={kind}>
       {STROKES[kind].map(([stroke, width, dash]) => (
-        <path key={stroke} d={path} stroke={stroke} stroke-width={width} stroke-dasharray={dash}>
+        <path key={stroke} d={path} stroke={stroke} stroke-width={width} stroke-dasharray={dash} stroke-linecap={capOf(kind)}>
           {title ? <title>{title}</title> : null}
         </path>
       ))}
@@ -120,8 +178,8 @@ export function Strokes({ kind, path, title }: { kind: Kind; path: string; title
 function Lines(one: At) {
   return (
     <>
-      {linesOf(one).map(({ kind, inside, title }, i) => (
-        <Strokes key={i} kind={kind} path={outline(one.how, inside)} title={title} />
+      {linesOf(one).map(({ kind, path, title }, i) => (
+        <Strokes key={i} kind={kind} path={path()} title={title} />
       ))}
     </>
   );
@@ -134,7 +192,7 @@ function cellAt(event: MouseEvent & { currentTarget: Element }, how: CameraLayou
   return Math.max(0, Math.min(how.rows - 1, row)) * how.columns + Math.max(0, Math.min(how.columns - 1, column));
 }
 
-/** What is said of a cell: its share of attention, its lift, the objects that cover it. */
+/** What is said of a cell: its share of attention, its lift, the objects that cover it; and how it moves the action. */
 function aboutCell({ scene, camera, how, at }: At, cell: number): string {
   const [mass, even] = [massesOf(scene, at), evenOf(scene, at)];
   if (!mass || !even) return "";
@@ -144,7 +202,17 @@ function aboutCell({ scene, camera, how, at }: At, cell: number): string {
     .filter(([, ofReplans]) => ofReplans[at]?.includes(cell))
     .map(([name]) => name.replaceAll("_", " "));
   const where = `row ${Math.floor(cell / how.columns)}, column ${cell % how.columns}`;
-  return `${where}: ${percent(sums[cell])} of all attention, ${percent(sums[cell]! / ofPicture)} of this picture's, ${shown(cellLifts(mass, even, how)[cell])} times even${things.length ? `, ${things.join(", ")}` : ""}`;
+  const moved = movesAt(scene, camera, at);
+  const exact = moved?.exact.find((one) => one.cell === cell);
+  const moves = moved ? `; moves the action ${shown(moved.lift[cell])} times the mean patch` : "";
+  const without = exact ? `, exact: without it ${exact.said}` : "";
+  return `${where}: ${percent(sums[cell])} of all attention, ${percent(sums[cell]! / ofPicture)} of this picture's, ${shown(cellLifts(mass, even, how)[cell])} times even${things.length ? `, ${things.join(", ")}` : ""}${moves}${without}`;
+}
+
+/** What is said of a picture while none of its cells is pointed at. */
+function noteOf({ scene, camera, how, at }: At): string {
+  const isMissing = scene.moves.value.value && isDrawn(scene, "moves") && !movesAt(scene, camera, at);
+  return `${isMissing ? " no map of what moves the action was made at this call" : ""}${how.note ? ` ${how.note}` : ""}`;
 }
 
 /** Pictures that were asked for and are not there. */
@@ -224,7 +292,7 @@ function Picture(given: At) {
           />
         ) : null}
         {how.stored ? null : " no pictures were stored: attention alone"}
-        <span class="soft">{here !== null ? ` ${aboutCell(one, here)}` : how.note ? ` ${how.note}` : ""}</span>
+        <span class="soft">{here !== null ? ` ${aboutCell(one, here)}` : noteOf(one)}</span>
       </figcaption>
     </figure>
   );
@@ -257,17 +325,43 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
   );
 }
 
+/** A piece of a kind of lines, from a place on. */
+export const sampleOf = (kind: Kind, x = 2, y = 4): string => (kind === "exact" ? `M${x + 10} ${y}h0` : `M${x} ${y}h20`);
+
+/** What lines go around, where there are maps of what moves the action. */
+function ChooseLines() {
+  if (!sides.value.some(({ scene }) => scene.layout.value?.moves)) return null;
+  const known = sides.value.map(({ scene }) => scene.moves.value.value).find((one) => one);
+  const squares = known?.marked ? " Squares: patches that were taken away by an exact call too." : "";
+  return (
+    <fieldset class="shades soft" aria-label="Lines">
+      lines around{" "}
+      {Object.entries(LINES).map(([name, title]) => (
+        <button key={name} class="chip" aria-pressed={part("lines") === name} onClick={() => setPart({ lines: name })}>
+          {title}
+        </button>
+      ))}
+      <Hint
+        text={`Read: attention, times an even spread. Moves the action: ${known?.how}, on a scale of its own (times the mean patch of the call).${squares} Point at a patch, and what that does is said below the picture.`}
+      />
+    </fieldset>
+  );
+}
+
 export function Legend() {
   return (
-    <p class="legend soft">
-      {(Object.keys(STROKES) as Kind[]).filter(meaning).map((kind) => (
-        <span key={kind}>
-          <svg viewBox="0 0 24 8" class="sample" aria-hidden="true">
-            <Strokes kind={kind} path="M2 4H22" />
-          </svg>
-          {meaning(kind)}
-        </span>
-      ))}
-    </p>
+    <>
+      <ChooseLines />
+      <p class="legend soft">
+        {(Object.keys(STROKES) as Kind[]).filter(meaning).map((kind) => (
+          <span key={kind}>
+            <svg viewBox="0 0 24 8" class="sample" aria-hidden="true">
+              <Strokes kind={kind} path={sampleOf(kind)} />
+            </svg>
+            {meaning(kind)}
+          </span>
+        ))}
+      </p>
+    </>
   );
 }

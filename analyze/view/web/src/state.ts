@@ -8,6 +8,7 @@ import {
   type EpisodeEvent,
   type EpisodeLine,
   type Groups,
+  type Moves,
   type NumberArray,
   type RunNumbers,
   readArray,
@@ -66,6 +67,7 @@ const DEFAULTS = {
   task: "",
   show: "all",
   curve: "ratio",
+  lines: "both",
   step: "",
   sort: "task",
   target: "",
@@ -223,6 +225,7 @@ export interface Scene {
   readonly rows: ReadonlySignal<Answer<NumberArray>>;
   readonly groups: ReadonlySignal<Answer<Groups>>;
   readonly covered: ReadonlySignal<Answer<Covered>>;
+  readonly moves: ReadonlySignal<Answer<Moves>>;
   /** Of every replan: masses of keys, (key). */
   readonly masses: ReadonlySignal<Float64Array[] | null>;
   /** The same of uniform attention, of every replan or once. */
@@ -246,6 +249,7 @@ function sceneOf(ofRun: ReadonlySignal<number>, name: ReadonlySignal<string>): S
   const steps = computed(() => position(axes.value?.denoise_steps, denoise.value));
   const groups = answered<Groups>(() => readAt(ofSite(`groups/${denoise.value}/${head.value}.json`)));
   const covered = answered<Covered>(() => readAt(ofSite("objects.json")));
+  const moves = answered<Moves>(() => readAt(about.value.value?.sites[site.value]?.moves ? ofSite("moves.json") : null));
   const typed = answered<{ keys: [number, number][][] }>(() => {
     const { selector } = picked.value;
     return selector ? readAt(ofSite(`keys.json?${new URLSearchParams({ selector })}`)) : null;
@@ -257,8 +261,9 @@ function sceneOf(ofRun: ReadonlySignal<number>, name: ReadonlySignal<string>): S
     rows,
     groups,
     covered,
+    moves,
     typed,
-    ready: computed(() => ![about, rows, uniform, groups, covered, typed].some(({ value }) => value.pending)),
+    ready: computed(() => ![about, rows, uniform, groups, covered, moves, typed].some(({ value }) => value.pending)),
     layout: computed(() => about.value.value?.sites[site.value] ?? null),
     masses: computed(() => rows.value.value && keyMasses(rows.value.value, steps.value, position(axes.value?.heads, head.value))),
     even: computed(() => uniform.value.value && keyMasses(uniform.value.value, steps.value, "mean")),

@@ -44,15 +44,29 @@ export function cellLifts(masses: ArrayLike<number>, uniform: ArrayLike<number>,
   return cellSums(masses, camera).map((mass, cell) => (even[cell]! > 0 ? mass / even[cell]! : NaN));
 }
 
-/** Lines around the cells for which `inside` holds, as a path in units of cells, or of so many pixels a cell. */
+/** Lines around the cells for which `inside` holds, as a path in units of cells, or of so many pixels a cell; `by`: so far
+ * within them, in parts of a cell. */
 export function outline(
   { rows, columns }: { rows: number; columns: number },
   inside: (cell: number) => boolean,
   [wide, high]: readonly [number, number] = [1, 1],
+  by = 0,
 ): string {
   const parts: string[] = [];
   const holds = (row: number, column: number): boolean =>
     row >= 0 && row < rows && column >= 0 && column < columns && inside(row * columns + column);
+  for (let cell = 0; by && cell < rows * columns; cell++) {
+    const [row, column] = [Math.floor(cell / columns), cell % columns];
+    if (!holds(row, column)) continue;
+    const free = [holds(row - 1, column), holds(row + 1, column), holds(row, column - 1), holds(row, column + 1)].map((held) =>
+      held ? 0 : by,
+    );
+    const [top, bottom] = [(row + free[0]!) * high, (row + 1 - free[1]!) * high];
+    const [left, right] = [(column + free[2]!) * wide, (column + 1 - free[3]!) * wide];
+    const sides = [`M${left} ${top}H${right}`, `M${left} ${bottom}H${right}`, `M${left} ${top}V${bottom}`, `M${right} ${top}V${bottom}`];
+    parts.push(...sides.filter((_, i) => free[i]));
+  }
+  if (by) return parts.join("");
   // Runs of edges become one line each.
   for (let row = 0; row <= rows; row++) {
     for (let column = 0, begin = -1; column <= columns; column++) {
