@@ -1,4 +1,6 @@
-"""Draw the pictures of `docs/reading.md` from made-up rows with a known truth, with the tool's own commands.
+"""Draw the pictures of `docs/reading.md` and `docs/effects.md`, with the tool's own commands.
+
+Those of `docs/reading.md` are of made-up rows with a known truth, `moves` is of the example store.
 
 Usage: python scripts/make_pictures.py [--folder docs/pictures]
 """
@@ -15,9 +17,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import vla_attention as va
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import libero_tokens
 from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 
@@ -108,6 +112,12 @@ def main() -> None:
     for name, (plant, changes, command, picture) in cases.items():
         store = write_store(scratch / f"{name}.zarr", spec=shape, plant_rows=plant, suite="made_up", **changes)
         draw(name, store, command, picture, scratch / name, folder)
+    store = scratch / "moves.zarr"
+    words = ["rerun", str(va.example("cubes")), "--effects", "map:8x8", "--task", "0", "--num-episodes", "1"]
+    if capture([*words, "--output", str(store)]):
+        raise SystemExit("moves: the rerun failed")
+    command = ["overlay", "--episode", "0", "--cameras", "base_0_rgb"]
+    draw("moves", store, command, None, scratch / "moves", folder)
     shutil.rmtree(scratch)
 
 
