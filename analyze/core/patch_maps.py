@@ -40,9 +40,8 @@ Array = NDArray[np.float64]
 TOP, TRUSTED = 0.1, 0.5
 #: With fewer patches above rounding, their order says nothing.
 _FEWEST_DRAWN = 4
-#: Columns of `patch_maps` that are of things, beside those of single objects.
+#: Columns of `patch_maps` that are of things.
 _THINGS = ("named", "robot")
-_OBJECT = "object:"
 
 
 def any_map(question: Question) -> bool:
@@ -64,12 +63,11 @@ def patch_maps(question: Question, units: ActionUnits) -> pl.DataFrame:
         first of the block's), num_keys; first_order (an order alone; null in other maps); exact, the first part of
         `units` without it, and exact_rms, of the normalised actions; floor, the same of an unchanged call: less is
         rounding; drawn: whether it was drawn at random; attention: of the action queries to its keys; named, robot: the
-        parts of it that what the sentence names and the robot cover, null where that is not known; and the same of each
-        object, as "object:NAME".
+        parts of it that what the sentence names and the robot cover, null where that is not known.
     """
     frames = [_patches(question, item, one, units) for item in question.selected
               if (one := map_of(item)) is not None and one.site == question.site]  # fmt: skip
-    return pl.concat(frames, how="diagonal") if frames else pl.DataFrame()
+    return pl.concat(frames) if frames else pl.DataFrame()
 
 
 def _patches(question: Question, item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> pl.DataFrame:
@@ -129,17 +127,22 @@ def _floor(item: SelectedEpisode, one: EffectMap) -> Array:
 
 def _covered(item: SelectedEpisode) -> dict[str, Array]:
     """The parts (replan, key) of each patch that things cover, see `patch_maps`; NaN where that is not known."""
-    tokens, things, layout = item.tokens, item.tokens.objects, item.tokens.layout
-    unknown = np.full((tokens.num_replans, layout.num_keys), np.nan)
-    named, coverage = told_things(item), tokens.coverage
-    if named is None or not coverage:
-        return dict.fromkeys(_THINGS, unknown)
-    each = np.full((tokens.num_replans, layout.num_keys, len(things)), np.nan)
-    for camera, shares in coverage.items():
-        each[:, layout.patch_keys(camera)] = shares
+    things, named, each = item.tokens.objects, told_things(item), _coverage(item)
+    if named is None or each is None:
+        return dict.fromkeys(_THINGS, np.full((item.tokens.num_replans, item.tokens.layout.num_keys), np.nan))
     found = {"named": each[..., [thing.name in named for thing in things]].sum(axis=-1)}
-    found["robot"] = each[..., [thing.kind == "robot" for thing in things]].sum(axis=-1)
-    return found | {f"{_OBJECT}{thing.name}": each[..., i] for i, thing in enumerate(things)}
+    return found | {"robot": each[..., [thing.kind == "robot" for thing in things]].sum(axis=-1)}
+
+
+def _coverage(item: SelectedEpisode, replans: slice = slice(None)) -> Array | None:
+    """The part of each patch that each object covers, (replan, key, object), NaN beside patches; None: not known."""
+    if not item.tokens.coverage:
+        return None
+    layout, number = item.tokens.layout, item.tokens.num_replans
+    each = np.full((len(range(number)[replans]), layout.num_keys, len(item.tokens.objects)), np.nan)
+    for camera, shares in item.tokens.coverage.items():
+        each[:, layout.patch_keys(camera)] = shares[replans]
+    return each
 
 
 def calls_of_maps(patches: pl.DataFrame, question: Question) -> pl.DataFrame:
@@ -208,14 +211,21 @@ def summary_of_maps(episodes: pl.DataFrame, question: Question, by: Collection[s
 
 def named_in_maps(question: Question, patches: pl.DataFrame) -> Naming:
     """Named against not named, as `core.naming`: of each object its part of the sizes, in maps of blocks."""
-    exact = patches.filter(pl.col("way") != "first order", replan=0) if patches.height else patches
-    names = [name for name in patches.columns if name.startswith(_OBJECT)]
-    if exact.is_empty() or not names:
-        return Naming(None, pl.DataFrame(), pl.DataFrame(), ())
-    parts = [(pl.col("exact") * pl.col(name)).sum().alias(name) / pl.col("exact").sum() for name in names]
-    wide = exact.group_by(EPISODE_ID, maintain_order=True).agg(parts)
-    x = wide.unpivot(names, index=EPISODE_ID, variable_name="item", value_name="x")
-    logs = x.filter(pl.col("x") > 0).select(
-        *EPISODE_ID, pl.lit(ALL_CAMERAS).alias("camera"), pl.col("item").str.strip_prefix(_OBJECT), pl.col("x").log()
-    )
-    return in_same_states(question, logs)
+    first = patches.filter(pl.col("way") != "first order", replan=0).partition_by(EPISODE_ID, as_dict=True)
+    rows = []
+    for item in question.selected:
+        one, call, cover = map_of(item), first.get(item.key), _coverage(item, slice(1))
+        if one is None or call is None or cover is None:
+            continue
+        sizes = np.zeros(one.num_blocks)
+        sizes[call["patch"]] = call["exact"].fill_null(0.0)
+        of_key = (sizes / np.bincount(one.blocks))[list(one.blocks)]
+        parts = of_key @ cover[0, list(one.keys)] / max(sizes.sum(), np.finfo(float).tiny)
+        rows += [
+            (*item.key, thing.name, ALL_CAMERAS, float(np.log(part)))
+            for thing, part in zip(item.tokens.objects, parts, strict=True)
+            if part > 0
+        ]
+    schema = {name: patches.schema[name] for name in EPISODE_ID}
+    schema |= {"item": pl.String(), "camera": pl.String(), "x": pl.Float64()}
+    return in_same_states(question, pl.DataFrame(rows, schema, orient="row"))
