@@ -109,8 +109,8 @@ def _zarr_works_without_threads() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _readers_of_foreign_files_are_kept() -> Iterator[None]:
     """Some import torch, which takes two seconds: what one reader has closed serves the next one of the same limits."""
-    from vla_attention.capture.foreign_files import bounded
-    from vla_attention.capture.foreign_files.bounded import BoundedProcess
+    from vla_attention.schemas import bounded_process
+    from vla_attention.schemas.bounded_process import BoundedProcess
 
     idle: dict[tuple[object, ...], list[dict[str, Any]]] = defaultdict(list)
     begin, end = BoundedProcess._start, BoundedProcess.close
@@ -121,7 +121,7 @@ def _readers_of_foreign_files_are_kept() -> Iterator[None]:
     def start(self: BoundedProcess) -> bool:
         if self._end is None and idle[kind(self)]:
             vars(self).update(idle[kind(self)].pop())
-            self._end = weakref.finalize(self, bounded._end, self._process, self._connection, self._owner)
+            self._end = weakref.finalize(self, bounded_process._end, self._process, self._connection, self._owner)
         return begin(self)
 
     def close(self: BoundedProcess) -> None:

@@ -15,9 +15,9 @@ docs/my-data-set.md describes both.
 
 from __future__ import annotations
 
-from vla_attention.capture.replay.data_set_files import DataSetError
-from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
-from vla_attention.capture.replay.lerobot_dataset import open_dataset as open
 from vla_attention.capture.replay.policy_file import ReplayPolicy
+from vla_attention.schemas.data_sets.data_set_files import DataSetError
+from vla_attention.schemas.data_sets.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
+from vla_attention.schemas.data_sets.lerobot_dataset import open_dataset as open
 
 __all__ = ["DataSetEpisode", "DataSetError", "DataSetFrame", "LeRobotDataset", "ReplayPolicy", "open"]

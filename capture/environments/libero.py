@@ -24,7 +24,7 @@ from vla_attention.capture.environments.libero_pro import (
     register_objects,
 )
 from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
-from vla_attention.capture.foreign_files.checked_files import check_regular
+from vla_attention.schemas.checked_files import check_regular
 from vla_attention.schemas.episode_steps import Displaced, TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError, look_up
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -39,7 +39,7 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
     Raises:
         UnusableTask: the file is missing, damaged, or holds anything else.
     """
-    from vla_attention.capture.foreign_files.torch_files import load_torch
+    from vla_attention.capture.torch_files import load_torch
 
     rebuild = np.empty(0).__reduce__()[0]
     array_types = [

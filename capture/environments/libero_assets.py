@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vla_attention.capture.environments.libero_installation import package_folder
-from vla_attention.capture.foreign_files.checked_files import check_folder
+from vla_attention.schemas.checked_files import check_folder
 from vla_attention.schemas.errors import INSTALL_LIBERO_ASSETS, UserError, listing
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"

@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
 
-from vla_attention.capture.foreign_files.checked_files import check_regular, read_object
+from vla_attention.schemas.checked_files import check_regular, read_object
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import sentencepiece
 
-from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.schemas.checked_files import check_regular
 
 #: Bytes of a model. PaliGemma's, of 257,152 pieces, has 4.3 MB.
 MAX_MODEL_BYTES = 64_000_000

@@ -25,7 +25,6 @@ from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.policies.robot import Robot
-from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
 from vla_attention.capture.replay.replay_plan import (
     ReplayPlan,
     announce_replay,
@@ -34,9 +33,10 @@ from vla_attention.capture.replay.replay_plan import (
     record_episodes,
     success_of,
 )
-from vla_attention.capture.replay.video import decoder_version
 from vla_attention.capture.store.replan_records import EpisodeStart
 from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.data_sets.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
+from vla_attention.schemas.data_sets.video import decoder_version
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import picture_size
 

@@ -17,7 +17,6 @@ from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, 
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.robot import NONE, RobotData
-from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
 from vla_attention.capture.replay.policy_file import ReplayPolicy
 from vla_attention.capture.replay.replay_plan import (
     ReplayPlan,
@@ -27,9 +26,10 @@ from vla_attention.capture.replay.replay_plan import (
     record_episodes,
     success_of,
 )
-from vla_attention.capture.replay.video import decoder_version
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun
+from vla_attention.schemas.data_sets.lerobot_dataset import DataSetEpisode
+from vla_attention.schemas.data_sets.video import decoder_version
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import picture_size

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_attention.capture.replay.lerobot_dataset import DataSetFrame
+from vla_attention.schemas.data_sets.lerobot_dataset import DataSetFrame
 from vla_attention.schemas.errors import BadArgument, listing
 
 if TYPE_CHECKING:

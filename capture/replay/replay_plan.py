@@ -21,11 +21,11 @@ from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.worker_log import plan_of
 from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.arguments import ReplaySettings
-from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
-from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
-from vla_attention.capture.replay.video import import_av
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, check_target
+from vla_attention.schemas.data_sets.data_set_files import INDEX_COLUMNS
+from vla_attention.schemas.data_sets.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
+from vla_attention.schemas.data_sets.video import import_av
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.options import read_options
 from vla_attention.schemas.progress_bar import progress_bar

@@ -31,8 +31,8 @@ from vla_attention.capture.environments.cubes.scene import TRAINING
 from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, NUM_BASE_TASKS, CubeTask
 from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
-from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.pi.preprocess import libero_state, resize_with_pad, turn
+from vla_attention.schemas.checked_files import read_object
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.store_format import Protocol

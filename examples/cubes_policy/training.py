@@ -22,12 +22,12 @@ from examples.cubes_policy.network import initial_model, small_config
 from examples.cubes_policy.objectives import WEIGHTS, Heads, losses, total
 from examples.cubes_policy.vocabulary import make_tokenizer
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
-from vla_attention.capture.foreign_files.checked_files import read_object
-from vla_attention.capture.foreign_files.torch_files import load_torch
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import Statistics
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
+from vla_attention.capture.torch_files import load_torch
+from vla_attention.schemas.checked_files import read_object
 from vla_attention.schemas.errors import BadArgument, UserError
 
 CHECKPOINT, TOKENIZER, SETTINGS, LOG = "checkpoint.pt", "tokenizer.model", "settings.json", "log.csv"

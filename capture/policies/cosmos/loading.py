@@ -31,10 +31,10 @@ from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, T5Encoder
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, lasting_name, would_be_fetched
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.hub import downloads, lasting_name, would_be_fetched
 
 
 @dataclass(frozen=True)

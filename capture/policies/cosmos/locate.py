@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.capture.policies.checkpoints import (
     CheckpointNotFound,
     UnreadableCheckpoint,
     UnsupportedCheckpoint,
     check_checkpoint_file,
 )
-from vla_attention.capture.policies.hub import in_hub_cache, local_or_fetched
+from vla_attention.schemas.checked_files import check_regular
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.hub import in_hub_cache, local_or_fetched
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
 #: Repository of the image encoder, which the policy's own repository does not contain.

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.schemas.checked_files import read_object
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
 

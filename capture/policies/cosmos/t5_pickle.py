@@ -16,10 +16,10 @@ import torch
 import torch._utils
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.bounded import BoundedProcess
-from vla_attention.capture.foreign_files.checked_files import check_regular
-from vla_attention.capture.foreign_files.torch_files import reason_of, tensor_problem
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.torch_files import reason_of, tensor_problem
+from vla_attention.schemas.bounded_process import BoundedProcess
+from vla_attention.schemas.checked_files import check_regular
 from vla_attention.schemas.errors import UnknownName, listing
 
 #: The command that adds sentences to such a file.

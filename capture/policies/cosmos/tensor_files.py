@@ -10,10 +10,10 @@ from typing import Any
 
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.checked_files import check_regular
-from vla_attention.capture.foreign_files.torch_files import load_torch, tensor_problem
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.safetensors_file import open_safetensors
+from vla_attention.capture.torch_files import load_torch, tensor_problem
+from vla_attention.schemas.checked_files import check_regular
 
 #: Types in the pickle of Transformer Engine's extra state: plain bytes.
 _EXTRA_STATE: list[Any] = [io.BytesIO, bytes, _codecs.encode]

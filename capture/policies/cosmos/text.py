@@ -20,8 +20,8 @@ from torch import Tensor
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
 from vla_attention.capture.policies.cosmos.locate import T5_TOKENIZER
 from vla_attention.capture.policies.cosmos.t5_pickle import TextEmbeddings
-from vla_attention.capture.policies.hub import first_line
 from vla_attention.schemas.errors import BadArgument, MissingDependency
+from vla_attention.schemas.hub import first_line
 from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
 

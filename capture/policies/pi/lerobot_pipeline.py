@@ -16,7 +16,6 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.checkpoints import (
     CheckpointNotFound,
     UnreadableCheckpoint,
@@ -28,6 +27,7 @@ from vla_attention.capture.policies.pi.lerobot_config import ACTION_FEATURE, STA
 from vla_attention.capture.policies.pi.preprocess import Normaliser
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.capture.policies.safetensors_file import open_safetensors
+from vla_attention.schemas.checked_files import read_object
 from vla_attention.schemas.errors import listing
 
 POSTPROCESSOR = "policy_postprocessor.json"

@@ -11,7 +11,6 @@ import torch
 from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, lasting_name, would_be_fetched
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -55,6 +54,7 @@ from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.robot import read_camera_choices
 from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.hub import downloads, lasting_name, would_be_fetched
 
 
 def load_pi_model(

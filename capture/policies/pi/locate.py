@@ -10,13 +10,13 @@ import os
 from pathlib import Path
 
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
-from vla_attention.capture.policies.hub import (
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.hub import (
     CheckpointUnavailable,
     in_hub_cache,
     local_or_fetched,
     snapshots_folder,
 )
-from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import check_inner_path
 
 #: Files of a hub repository that a policy needs; only these are downloaded.

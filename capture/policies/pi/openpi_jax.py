@@ -17,15 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
-from vla_attention.capture.policies.hub import first_line
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
 from vla_attention.capture.policies.pi.sizes import check_jax_heads
 from vla_attention.capture.policies.weights import Shapes, check_floats, check_shapes
+from vla_attention.schemas.checked_files import check_folder
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.hub import first_line
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.schemas.checked_files import read_object
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.fitted_pictures import fitted_box
 from vla_attention.schemas.jsonable import MalformedDocument, from_json

@@ -13,7 +13,7 @@ import pytest
 
 from tests.kit.thorough import asked_for
 from tests.thorough.hostile_data_sets.run_cases import CASES, GOOD
-from vla_attention.capture.foreign_files.bounded import MOST_BYTES
+from vla_attention.schemas.bounded_process import MOST_BYTES
 
 #: Processor time that a refusal may take beyond start-up.
 MOST_SECONDS = 5.0

@@ -11,9 +11,6 @@ from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.policies.hub import (
-    hub_cache,
-)
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.loading import build_pi_policy
@@ -21,6 +18,9 @@ from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
     find_checkpoint,
     openpi_cache,
+)
+from vla_attention.schemas.hub import (
+    hub_cache,
 )
 
 URL = "gs://openpi-assets/checkpoints/pi05_libero"

@@ -11,8 +11,8 @@ import torch
 from torch import nn
 
 from vla_attention.capture.environments.libero import UnusableTask, load_initial_states
-from vla_attention.capture.foreign_files.torch_files import load_torch, tensor_problem
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
+from vla_attention.capture.torch_files import load_torch, tensor_problem
 from vla_attention.schemas.errors import BadArgument
 
 SHARED = torch.arange(10.0)

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from vla_attention.capture.foreign_files.checked_files import Refuse
+from vla_attention.schemas.checked_files import Refuse
 from vla_attention.schemas.errors import UserError
 
 Given = ParamSpec("Given")

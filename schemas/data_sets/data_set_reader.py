@@ -15,8 +15,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.capture.replay.data_set_files import DamagedDataSet, DataSetNotFound, read_table, scan_table
-from vla_attention.capture.replay.video import VideoFile
+from vla_attention.schemas.data_sets.data_set_files import DamagedDataSet, DataSetNotFound, read_table, scan_table
+from vla_attention.schemas.data_sets.video import VideoFile
 
 #: Rows of pictures that are in memory at once: with two cameras of a megabyte each, a quarter of a gigabyte.
 _ROWS = 128

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.replay.data_set_files import DamagedDataSet, DataSetError, DataSetNotFound
+from vla_attention.schemas.data_sets.data_set_files import DamagedDataSet, DataSetError, DataSetNotFound
 from vla_attention.schemas.errors import MissingDependency
 
 #: How many pictures before the wanted one decoding begins, one after the other until the picture comes out whole: a

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.foreign_files.bounded import BoundedProcess
-from vla_attention.capture.replay.data_set_files import (
+from vla_attention.schemas.bounded_process import BoundedProcess
+from vla_attention.schemas.data_sets.data_set_files import (
     INFO,
     META_FILES,
     DamagedDataSet,
@@ -24,7 +24,7 @@ from vla_attention.capture.replay.data_set_files import (
     Feature,
     read_info,
 )
-from vla_attention.capture.replay.data_set_reader import (
+from vla_attention.schemas.data_sets.data_set_reader import (
     check_video_time,
     open_episode,
     read_numbers,
@@ -294,7 +294,7 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
         MissingDependency, CheckpointUnavailable: the hub's client is missing, or the download failed.
     """
     # Imported here: a folder needs none of it.
-    from vla_attention.capture.policies.hub import downloads, fetch_from_hub, hub_version, split_hub_name
+    from vla_attention.schemas.hub import downloads, fetch_from_hub, hub_version, split_hub_name
 
     folder = Path(name).expanduser()
     on_hub = split_hub_name(str(name))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vla_attention.capture.foreign_files.bounded import BoundedProcess
+from vla_attention.schemas.bounded_process import BoundedProcess
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
 FILE = Path("robot/a file")

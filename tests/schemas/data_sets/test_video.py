@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, Encoding, number_of, numbered_picture, write_video
-from vla_attention.capture.replay.data_set_files import DamagedDataSet
-from vla_attention.capture.replay.video import UndecodableVideo, VideoFile
+from vla_attention.schemas.data_sets.data_set_files import DamagedDataSet
+from vla_attention.schemas.data_sets.video import UndecodableVideo, VideoFile
 
 FPS, FRAMES = 10, 90
 ENCODINGS = {

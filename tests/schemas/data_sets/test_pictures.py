@@ -11,8 +11,8 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from tests.kit.lerobot_data_sets import encoded, numbered_picture
-from vla_attention.capture.replay.data_set_files import DamagedDataSet
-from vla_attention.capture.replay.data_set_reader import decode_picture
+from vla_attention.schemas.data_sets.data_set_files import DamagedDataSet
+from vla_attention.schemas.data_sets.data_set_reader import decode_picture
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 64\n%%EndComments\nshowpage\n"
 

@@ -18,9 +18,9 @@ from tests.kit.lerobot_data_sets import (
     write_data_set,
 )
 from tests.kit.thorough import thorough_except
-from vla_attention.capture.replay.data_set_files import DamagedDataSet, DataSetNotFound, UnsupportedDataSet
-from vla_attention.capture.replay.lerobot_dataset import open_dataset
-from vla_attention.capture.replay.video import UndecodableVideo
+from vla_attention.schemas.data_sets.data_set_files import DamagedDataSet, DataSetNotFound, UnsupportedDataSet
+from vla_attention.schemas.data_sets.lerobot_dataset import open_dataset
+from vla_attention.schemas.data_sets.video import UndecodableVideo
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
 CAMERAS = ("observation.images.front", "observation.images.wrist")

@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.capture.foreign_files.checked_files import read_object
+from vla_attention.schemas.checked_files import read_object
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import decode_json
 from vla_attention.schemas.safe_text import check_inner_path

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.checked_files import Refuse, check_regular
+from vla_attention.schemas.checked_files import Refuse, check_regular
 from vla_attention.schemas.errors import listing
 
 

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from vla_attention.capture.foreign_files.checked_files import check_folder, check_regular
+from vla_attention.schemas.checked_files import check_folder, check_regular
 from vla_attention.schemas.errors import BadArgument
 
 

@@ -1,1 +1,0 @@
-"""Files from elsewhere: checked, or read in a process with limits; nothing in them is executed."""
