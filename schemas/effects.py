@@ -74,7 +74,7 @@ class MapBlocks(Document, frozen=True):
         """Check that there are blocks."""
         if min(self.rows, self.columns) < 1 or self.rows * self.columns < 2:
             raise BadArgument(
-                f"A map of {self.rows} x {self.columns} blocks of a picture; expected at least two blocks."
+                f"A map (--effects) of {self.rows} x {self.columns} blocks of a picture; expected two or more (8x8)."
             )
 
     def describe(self) -> str:
@@ -141,10 +141,12 @@ class EffectMap(Document, frozen=True):
     block `patch[i]` at replan `patch_replan[i]`, in the units of the episode's effects. Of each replan these are its
     strongest patches by first order, and some of the others that were drawn at random (`drawn[i]`), which say how far
     the order can be trusted. Of the other ways (`MapWay`) they are all blocks that show a part of a picture, and the
-    map has their sizes.
+    map has their sizes. Where all replans have the same blocks, and none is drawn, `patch` has them once, and
+    `patch_replan` and `drawn` are empty.
 
     keys: of the patches, at the site `site`, cameras in the order of its keys. blocks: the block of each of them; empty
-    where each is its own. reader: whose queries do without it, empty where the picture is another one.
+    where each is its own. grid: rows and columns of blocks of a picture, as they were asked for; empty where each patch
+    is its own. reader: whose queries do without it, empty where the picture is another one.
     """
 
     site: str
@@ -158,6 +160,19 @@ class EffectMap(Document, frozen=True):
     way: MapWay = "first order"
     blocks: tuple[int, ...] = ()
     reader: EffectReaders | Literal[""] = "all"
+    grid: tuple[int, ...] = ()
+
+    @property
+    def entries(self) -> list[tuple[int, int, bool]]:
+        """Replan and block of every entry of `effects/patch_change`, and whether it was drawn at random."""
+        if not self.patch_replan:
+            return [(replan, patch, False) for replan in self.replan for patch in self.patch]
+        return list(zip(self.patch_replan, self.patch, self.drawn, strict=True))
+
+    @property
+    def made_like(self) -> tuple[object, ...]:
+        """What two maps have in common whose sizes can be compared."""
+        return self.way, self.blocks, self.reader, self.steps, self.keys
 
     @property
     def num_blocks(self) -> int:
@@ -166,9 +181,8 @@ class EffectMap(Document, frozen=True):
 
     def __post_init__(self) -> None:
         """Check that entries are of replans and blocks of the map."""
-        if not len(self.patch) == len(self.patch_replan) == len(self.drawn) or not set(self.patch_replan) <= set(
-            self.replan
-        ):
+        numbers = {len(self.patch_replan), len(self.drawn)}
+        if numbers not in ({0}, {len(self.patch)}) or not set(self.patch_replan) <= set(self.replan):
             raise BadArgument("Exact changes of a map are of other replans than its rows.")
         if self.blocks and (len(self.blocks) != len(self.keys) or set(self.blocks) != set(range(max(self.blocks) + 1))):
             raise BadArgument(f"A map of {len(self.keys)} patches has blocks of others, or without a patch.")

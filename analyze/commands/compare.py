@@ -235,11 +235,16 @@ def _needs(part: Compared) -> list[Finding]:
     maps = part.rows["maps"].filter(ALL) if "maps" in part.rows else rows.clear()
     for row in _largest(maps).iter_rows(named=True):
         on = {"named": "what the sentence names", "robot": "the robot", "other": "neither named things nor the robot"}
-        said.append(f"{100 * row['difference']:+.0f} points of what patches do to the action lie on {on[row['item']]}")
-    text = "; ".join(said) if said else "no item's effect is shown to differ"
+        said.append(
+            f"{100 * row['difference']:+.0f} points of what blocks of the pictures do to it lie on {on[row['item']]}"
+        )
+    none = "no item's effect is shown to differ" if rows.height else "the maps are not shown to differ"
+    text = "; ".join(said) if said else none
     limit = "Trust exchanged words more than missing ones: a sentence with a missing word is new to the policy."
+    limit = limit if rows.height else ""
     if "maps" not in part.rows and all(any_map(run.run.question) for run in (part.first, part.other)):
-        limit += " Maps are not compared: they were not made in the same way, or none has the objects."
+        limit = f"{limit} Maps are not compared: blocks, readers or steps differ, or no coverage is known.".strip()
+        text = text if rows.height else "not compared"
     return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers, limit)]
 
 

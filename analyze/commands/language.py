@@ -12,7 +12,7 @@ from dataclasses import replace
 import polars as pl
 
 from vla_attention.analyze.commands.effects import word_effects
-from vla_attention.analyze.commands.effects.maps import ASKS_NAMED, maps_where_recorded
+from vla_attention.analyze.commands.effects.maps import maps_where_recorded
 from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
@@ -48,7 +48,7 @@ def language(question: Question) -> Result:
     by_change, changes = _perturbed(question, asked)
     reached = words_get_through(question)
     decide, effects = word_effects(question)
-    named = [finding for finding in maps_where_recorded(question)[0] if finding.asks == ASKS_NAMED]
+    named, _ = maps_where_recorded(question, only_named=True)
     read = words(question)
     missing = len(question.selected) - asked.height
     rerun = all(store.attributes.rerun_of is not None for store in question.stores)

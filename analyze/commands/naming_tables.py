@@ -73,8 +73,11 @@ def of_objects(question: Question, named: Naming, row: dict[str, Any]) -> Findin
 
 def times(row: Mapping[str, Any], name: str) -> str:
     """`7.2 times [5.2, 10]`; the value alone without an interval."""
-    low, high = row[f"{name}_low"], row[f"{name}_high"]
-    return f"{row[name]:.2g} times" + ("" if low is None else f" [{low:.2g}, {high:.2g}]")
+    size, low, high = (
+        None if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.2g}"
+        for value in (row[name], row[f"{name}_low"], row[f"{name}_high"])
+    )  # fmt: skip
+    return f"{size} times" + ("" if low is None else f" [{low}, {high}]")
 
 
 def tables_of_naming(named: Naming, later: pl.DataFrame) -> tuple[list[Table], list[Table]]:

@@ -105,9 +105,11 @@ def of_both(
         return []
     both, number, patches = (float(mean) for mean in np.mean(calls, axis=0))
     chance = float(np.mean([number**2 / patches for _, number, patches in calls]))
+    by_order = any(moves is not None and moves.way == "first order" for moves in moved)
+    most = "are first in the order of what moves the action" if by_order else "move the action most"
     said = (
-        f"Of the {number:.2g} patches that are read most, {both:.2g} are among the {number:.2g} that move the action "
-        f"most (of {patches:.0f}; by chance {chance:.2g}), "
+        f"Of the {number:.2g} patches that are read most, {both:.2g} are among the {number:.2g} that {most} "
+        f"(of {patches:.0f}; by chance {chance:.2g}), "
         + ("in the call shown." if len(calls) == 1 else f"mean of the {plural(len(calls), 'call')} shown.")
     )
     numbers = {"both": both, "number": number, "patches": patches, "chance": chance, "calls": len(calls)}

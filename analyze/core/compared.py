@@ -23,7 +23,7 @@ from vla_attention.analyze.core.measure import Measured, look_at, table_of
 from vla_attention.analyze.core.naming import Naming, ObjectAttention, looks_at_objects, named_in
 from vla_attention.analyze.core.object_shares import object_values
 from vla_attention.analyze.core.pairs import MOST_APART, pairing, pairs_of, with_first_pictures
-from vla_attention.analyze.core.patch_maps import calls_of_maps, episodes_of_maps, patch_maps
+from vla_attention.analyze.core.patch_maps import calls_of_maps, episodes_of_maps, map_of, patch_maps
 from vla_attention.analyze.core.recorded_effects import ITEM, recorded_effects
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
@@ -213,7 +213,8 @@ def _effects(first: Run, other: Run) -> tuple[list[pl.DataFrame], ActionUnits] |
 def _maps(first: Run, other: Run, units: ActionUnits) -> list[pl.DataFrame]:
     """The parts of what moves the action, of `patch_maps`, of both runs; none unless both have maps made alike."""
     maps = [patch_maps(run.question, units) for run in (first, other)]
-    if any(one.is_empty() for one in maps) or len({way for one in maps for way in one["way"].unique()}) > 1:
+    forms = {one.made_like for run in (first, other) for item in run.question.selected if (one := map_of(item))}
+    if any(one.is_empty() for one in maps) or len(forms) > 1:
         return []
     which = "top" if maps[0]["way"][0] == "first order" else "all"
     names = {f"{which}_{name}": name for name in ("named", "robot", "other")}

@@ -15,10 +15,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.action_changes import ActionUnits, BaseEpisode
+from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.camera_maps import EpisodeMaps, PictureMap, upright, view_of
+from vla_attention.analyze.core.patch_maps import exact_changes
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.schemas.effects import MAP, PATCH_CHANGE, EffectMap, MapWay
+from vla_attention.schemas.effects import MAP, MapWay
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
@@ -86,12 +87,14 @@ class EpisodeMoves:
         cameras: by name, in key order.
         way: how it was made.
         marked: whether patches are marked: those of exact calls, where not all are.
+        single: whether each block is one patch.
     """
 
     replan: tuple[int, ...]
     cameras: Mapping[str, CameraMoves]
     way: MapWay
     marked: bool
+    single: bool
 
     def row(self, replan: int) -> int | None:
         """The map row of a replan; None without a map."""
@@ -117,8 +120,10 @@ def episode_moves(item: SelectedEpisode, cameras: Sequence[str], units: ActionUn
     blocks = list(one.blocks or range(len(one.keys)))
     values = item.episode.read(MAP).astype(np.float64)[:, blocks]  # (map row, patch)
     keys, roles, layout = list(one.keys), item.tokens.static_roles, item.tokens.layout
+    sizes = exact_changes(item, one, units)[:, blocks]
     seen = roles[np.minimum(one.replan, len(roles) - 1)][:, keys] == Role.IMAGE
-    sizes = _exact(item, one, np.array(effects.units), units)[:, blocks]
+    if one.way != "first order":  # a block without an exact call has no size
+        seen = seen & np.isfinite(sizes)
     with np.errstate(divide="ignore", invalid="ignore"):
         mean = np.nanmean(np.where(seen, values, np.nan), axis=1, keepdims=True)
         lifts = np.where(mean > 0, values / mean, 0.0)  # where no patch does anything, none does more than others
@@ -133,17 +138,8 @@ def episode_moves(item: SelectedEpisode, cameras: Sequence[str], units: ActionUn
             # As the lift of attention: the sum of a cell over what it would be if all patches had the mean.
             lift = picture.spread(own["lift"]) / picture.spread(own["seen"])
             found[camera] = CameraMoves(picture, view_of(item, camera), lift, own["size"])
-    return EpisodeMoves(one.replan, found, one.way, one.way == "first order" and bool(one.patch))
-
-
-def _exact(item: SelectedEpisode, one: EffectMap, scale: Array, units: ActionUnits) -> Array:
-    """The exact change without each block, (map row, block); NaN where there was no exact call."""
-    sizes = np.full((len(one.replan), one.num_blocks), np.nan)
-    if one.patch:
-        at = BaseEpisode.of(item).at(np.array(one.patch_replan, np.int64))
-        change = item.episode.read(PATCH_CHANGE).astype(np.float64) * scale
-        sizes[np.searchsorted(one.replan, one.patch_replan), one.patch] = units.changes(at, at.actions + change)[:, 0]
-    return sizes
+    single = one.num_blocks == len(one.keys)
+    return EpisodeMoves(one.replan, found, one.way, one.way == "first order" and bool(one.patch), single)
 
 
 def in_both(maps: EpisodeMaps, moves: EpisodeMoves, replan: int) -> tuple[int, int, int] | None:
@@ -151,10 +147,10 @@ def in_both(maps: EpisodeMaps, moves: EpisodeMoves, replan: int) -> tuple[int, i
 
     Returns:
         that number; the number of patches that are compared on each side, at most `MOST`; and of all patches. None
-        without a map, and where cells of the pictures' maps are not single patches.
+        without a map, and where blocks, or cells of the pictures' maps, are not single patches.
     """
     row = moves.row(replan)
-    if row is None or not all(one.picture.cells_are_patches for one in moves.cameras.values()):
+    if row is None or not moves.single or not all(one.picture.cells_are_patches for one in moves.cameras.values()):
         return None
     read = np.concatenate([maps.cameras[camera].mass[replan].ravel() for camera in moves.cameras])
     moved = np.concatenate([one.lift[row].ravel() for one in moves.cameras.values()])

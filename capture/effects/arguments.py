@@ -33,7 +33,8 @@ class EffectSettings:
     items: tuple[str, ...] = option(
         f"{', '.join(ITEMS)} (the groups of a built-in grouping or TOML file), with commas between, or none (default). "
         "Each call is made again without each of them; text,cameras takes the time of 7 calls with a small pi, of 17 "
-        "with a large one",
+        "with a large one. map:8x8: which of 8 x 8 blocks of each picture move the action when no token reads them; "
+        "map:picture:8x8: when they are filled in the picture; map: every patch, by gradients, of pi0 and pi0.5",
         group="effects: the action without a word, a part, a picture (docs/effects.md)",
         name="effects",
         nargs=None,  # words with commas between
@@ -87,7 +88,7 @@ class EffectSettings:
             raise BadArgument(f"Effects take the groups of one grouping, not of {listing(groupings)}.")
         maps = tuple(dict.fromkeys(word for word in self.items if _MAP.fullmatch(word)))
         if len(maps) > 1:
-            raise BadArgument(f"Effects take one map, not {listing(maps)}.")
+            raise BadArgument(f"Effects (--effects) take one map, not {listing(maps)}.")
         for name, known in (("items", (*ITEMS[:4], *maps, *groupings)), ("readers", get_args(EffectReaders))):
             words = getattr(self, name)
             for word in words:

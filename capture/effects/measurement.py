@@ -33,6 +33,7 @@ from vla_attention.capture.policies.policy import (
     UnitsPolicy,
     VariantPolicy,
     changed_actions,
+    map_keys,
 )
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.command_line import format_bytes
@@ -100,7 +101,10 @@ class EffectMeasurement:
         blocks = self.planned.blocks
         if blocks is not None:
             number, how = len(picture_blocks(self.policy, blocks)), blocks.describe()
-            return f"Map: {plural(number, 'changed call')} a policy call; in each a block of the pictures is {how}."
+            alone = " Each block is one patch." if number == len(map_keys(self.policy)) else ""
+            return (
+                f"Map: {plural(number, 'changed call')} a policy call; in each a block of the pictures is {how}.{alone}"
+            )
         memory = format_bytes(cast(MapPolicy, self.policy).gradient_memory())
         return (
             f"Map: {PROJECTIONS} backward passes a policy call, which take about {memory} of memory, and exact calls "

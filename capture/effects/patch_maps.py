@@ -93,8 +93,14 @@ def check_map(planned: EffectsRecorded, policy: Policy) -> None:
             f"Cannot use --effects map with {policy.family}: its calls have no backward pass here. --effects map:4x4 "
             "hides blocks of patches one at a time."
         )
-    if planned.blocks is None and planned.denoise_steps < policy.num_denoise_steps:
-        raise BadArgument("Cannot use --effects-steps with --effects map: its order is of all denoise steps.")
+    if planned.denoise_steps < policy.num_denoise_steps:
+        raise BadArgument("Cannot use --effects-steps with a map: its rounding is that of a call of all denoise steps.")
+    readers = ("all",) if planned.blocks is None else ("all", "action")
+    if (planned.blocks is None or planned.blocks.way == "hidden") and not set(readers) & set(planned.readers):
+        raise BadArgument(
+            f"Cannot make this map for the readers {listing(planned.readers)}; add one of {listing(readers)} to "
+            "--effects-readers."
+        )
     if not any(site.pictured for site in policy.sites):
         raise BadArgument(f"Cannot make a map of {policy.name}: no key is a patch of a picture.")
     if planned.blocks is not None:
@@ -143,12 +149,16 @@ class CallMap:
         others = {camera: one for camera, one in was.camera_frames.items() if camera != block.camera}
         return CallVariant(policy.prepare_again(replace(was, frames=frames, camera_frames=others)), noise_seed, {})
 
-    def stored(self, policy: Policy, changes: Mapping[int, NDArray[np.float32]], shape: tuple[int, ...]) -> ReplanMap:
+    def stored(
+        self, policy: Policy, changes: Mapping[int, NDArray[np.float32]], shape: tuple[int, ...]
+    ) -> ReplanMap | None:
         """What is stored, with the changes of blocks by their places, each of a shape (horizon, action dim).
 
-        Those that are not finite are left out.
+        Those that are not finite are left out; None where nothing is left.
         """
         kept = [place for place in self.chosen if place in changes and np.isfinite(changes[place]).all()]
+        if not kept and self.first_order is None:
+            return None
         change = np.stack([changes[place] for place in kept]) if kept else np.zeros((0, *shape), np.float32)
         site = map_site(policy).name
         keys = [(key, place) for place, block in enumerate(self.blocks) for key in block.keys[site]]
@@ -159,6 +169,7 @@ class CallMap:
             form = EffectMap(
                 site, tuple(key for key, _ in keys), 0, self.steps, (), (), (), (), self.planned.way,
                 tuple(place for _, place in keys), "" if self.planned.way == "picture" else self.reader,
+                (self.planned.rows, self.planned.columns),
             )  # fmt: skip
         sizes = self.first_order
         if sizes is None:

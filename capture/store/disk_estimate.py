@@ -134,7 +134,7 @@ def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[Si
         patches = max(sum(span.num_keys for span in site.spans if span.grid is not None) for site in sites)
         blocks, exact = effects.blocks, patches / 5 + _MOST_ITEMS
         if blocks is not None:
-            exact = max(len(site.pictured) for site in sites) * blocks.rows * blocks.columns
+            exact = min(patches, max(len(site.pictured) for site in sites) * blocks.rows * blocks.columns)
         total += 4 * patches * _INCOMPRESSIBLE + exact * change
     return total / effects.every
 

@@ -381,9 +381,12 @@ class EpisodeWriter:
 
 def _map_of(maps: Sequence[tuple[int, ReplanMap]]) -> EffectMap:
     """What is said of the maps of some replans, which are of the same patches."""
+    form, replans = maps[0][1].form, tuple(replan for replan, _ in maps)
+    if len({of.patches for _, of in maps}) == 1 and not any(any(of.drawn) for _, of in maps):
+        return structs.replace(form, replan=replans, patch=maps[0][1].patches)
     return structs.replace(
-        maps[0][1].form,
-        replan=tuple(replan for replan, _ in maps),
+        form,
+        replan=replans,
         patch_replan=tuple(replan for replan, of in maps for _ in of.patches),
         patch=tuple(patch for _, of in maps for patch in of.patches),
         drawn=tuple(drawn for _, of in maps for drawn in of.drawn),

@@ -389,7 +389,7 @@ def effect_shapes(sites: Sequence[SiteLayout], entries: int, horizon: int, dims:
 
 def map_shapes(of: EffectMap, horizon: int, dims: int) -> dict[str, tuple[int, ...]]:
     """Shapes of the arrays of a map of patches; `dims` is the number of dimensions of an action."""
-    return {MAP: (len(of.replan), of.num_blocks), PATCH_CHANGE: (len(of.patch), horizon, dims)}
+    return {MAP: (len(of.replan), of.num_blocks), PATCH_CHANGE: (len(of.entries), horizon, dims)}
 
 
 def shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> Iterator[str]:

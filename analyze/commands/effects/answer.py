@@ -105,7 +105,7 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
     files = [Table("effects_summary", summary), Table("effects_episodes", episodes), Table("effects", found.rows())]
     otherwise, of_prompts = other_sentences(question, episodes, units, looks)
     if by:
-        said = f"Below, a row for each item and {' and '.join(by)}."
+        said = f"Below, a row for each {'item and ' * bool(items.height)}{' and '.join(by)}."
         _, maps = of_maps(question, units, by)
         if maps and "time" in by:
             said += " Maps of patches are not divided by time."

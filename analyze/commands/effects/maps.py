@@ -17,6 +17,7 @@ from vla_attention.analyze.core.patch_maps import (
     any_map,
     calls_of_maps,
     episodes_of_maps,
+    map_of,
     named_in_maps,
     patch_maps,
     summary_of_maps,
@@ -25,16 +26,10 @@ from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.analyze.core.result import Column, Finding, Table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, plural
 
 ASKS, ASKS_NAMED = "What in the picture moves the action?", "Does what is named move it more?"
 _PARTS = ("named", "robot", "other")
-#: What is taken away, by the way of the map.
-_TAKEN = {
-    "first order": "Take away one patch at a time: of how far the strongest tenth of the patches",
-    "hidden": "Hide one block of patches at a time: of how far all of them",
-    "picture": "Fill one block of the picture at a time from its surroundings: of how far all of them",
-}
 _LIMITS = {
     "first order": "One patch at a time: what several of them say, none of them moves.",
     "hidden": "One block at a time: what several of them say, none of them moves.",
@@ -42,15 +37,19 @@ _LIMITS = {
 }
 
 
-def maps_where_recorded(question: Question) -> tuple[list[Finding], list[Table]]:
-    """`of_maps` of a question that may have no effects at all."""
+def maps_where_recorded(question: Question, only_named: bool = False) -> tuple[list[Finding], list[Table]]:
+    """`of_maps` of a question that may have no effects at all; only_named: whether what is named moves it more."""
     if not any_map(question):
         return [], []
     try:
         found = recorded_effects(question, attention=False)
     except BadArgument as error:
         return [Finding(f"Not shown: {error}", ASKS)], []
-    return ([], []) if found is None else of_maps(question, found.units)
+    if found is None or not only_named:
+        return ([], []) if found is None else of_maps(question, found.units)
+    patches = patch_maps(question, found.units, first=True)
+    named = None if patches.is_empty() else named_in_maps(question, patches)
+    return ([], []) if named is None or named.form is None else ([_named(named, found.units, question)], [])
 
 
 def of_maps(question: Question, units: ActionUnits, by: Collection[str] = ()) -> tuple[list[Finding], list[Table]]:
@@ -71,12 +70,15 @@ def of_maps(question: Question, units: ActionUnits, by: Collection[str] = ()) ->
     which = "all" if summary["all_named"].count() else "top"
     title = "All blocks" if which == "all" else "The strongest tenth of the patches"
     kept = [column for column in columns_of(by) if column.name in (*calls.columns,)]
-    tables = [Table("maps_episodes", episodes, _columns(_OF_EPISODE, which, calls), title, rows=8)]
+    known = calls[f"{which}_named"].count() > 0
+    shown = _columns(_OF_EPISODE, which, calls) if known and not kept else []
+    tables = [Table("maps_episodes", episodes, shown, title, rows=8)]
     if kept:
         divided = summary_of_maps(episodes_of_maps(calls, by), question, by)
-        tables = [Table("maps_by", divided, _columns(kept, which, calls), title), tables[0]]
+        kept = [*kept, Column("num_episodes", "count", "episodes")]
+        tables = [Table("maps_by", divided, _columns(kept, which, calls) if known else [], title), tables[0]]
     outcomes = episodes.drop_nulls("success")
-    if outcomes["success"].n_unique() > 1:
+    if known and outcomes["success"].n_unique() > 1:
         divided = summary_of_maps(outcomes, question, ["outcome"])
         tables.append(Table("maps_outcomes", divided, _columns(columns_of(["outcome"]), which, calls), title))
     tables += [Table("maps_summary", summary), Table("maps", patches)]
@@ -100,10 +102,10 @@ def _columns(before: Collection[Column], which: str, calls: pl.DataFrame) -> lis
         *before,
         Column(f"{which}_named", "percent", "named", f"part of what {of} do that lies on what the sentence names"),
         Column(f"{which}_robot", "percent", "robot", "that lies on the robot"),
-        Column(f"{which}_other", "percent", "neither", "that lies on neither"),
+        Column(f"{which}_other", "percent", "the rest", "that lies on neither"),
         Column(f"attention_{which}_named", "percent", "attention: named", "the same of the attention"),
     ]
-    if which == "all":
+    if which == "all" and calls["top_other"].count():
         found.append(Column("top_other", "percent", "NMR@10", "of the strongest tenth, what lies on neither"))
     if calls["rank"].count():
         found.append(
@@ -112,8 +114,19 @@ def _columns(before: Collection[Column], which: str, calls: pl.DataFrame) -> lis
     return found
 
 
-def _does(units: ActionUnits) -> str:
-    return "move the hand" if units.centimetres is not None else "change the action"
+def _moved(units: ActionUnits) -> str:
+    return "how far the hand moves" if units.centimetres is not None else "how much the action changes"
+
+
+def _taken(question: Question, way: str) -> str:
+    """What is done to the pictures, of a map made in this way."""
+    if way == "first order":
+        return "Take the strongest tenth of the patches away, one at a time"
+    one = next(found for item in question.selected if (found := map_of(item)) is not None and found.way == way)
+    grid = f"({' x '.join(map(str, one.grid))} a picture) " if one.grid else ""
+    if way == "picture":
+        return f"Fill each block {grid}of the pictures in turn from its surroundings"
+    return f"Hide each block {grid}of the pictures in turn from {'all' if one.reader == 'all' else 'the action'} tokens"
 
 
 def _parts(row: Mapping[str, Any], patches: pl.DataFrame, units: ActionUnits, question: Question) -> Finding:
@@ -122,29 +135,50 @@ def _parts(row: Mapping[str, Any], patches: pl.DataFrame, units: ActionUnits, qu
     which = "top" if way == "first order" else "all"
     names = [f"{which}_{part}" for part in _PARTS]
     numbers = {"way": way, **{part: row[name] for part, name in zip(_PARTS, names, strict=True)},
-               "nmr10": row["top_other"], "rank": row["rank"], "rank_low": row["rank_low"]}  # fmt: skip
-    limits = [_order(row) if way == "first order" else "", _LIMITS[way], enough(question)]
+               "most_named": row["most_named"], "nmr10": row["top_other"], "median": row["median"],
+               "noise": row["noise"], "rank": row["rank"], "rank_low": row["rank_low"]}  # fmt: skip
+    sizes = "" if row["noise"] is None else f"Another noise seed does {units.short(row['noise'])}"
+    if row["median"] is not None:
+        sizes = f"The median block does {units.short(row['median'])}{sizes.replace('Another', ', another')}"
+    sizes += "." if sizes else ""
+    limits = [_order(row) if way == "first order" else "", sizes, _LIMITS[way], enough(question)]
     if row[names[0]] is None:
-        said = f"No single patch is found to {_does(units)}."
+        said = "No single patch is found to move the action."
         if patches["named"].null_count():
             said = (
                 "Not known of every patch whether it shows what the sentence names: no coverage of objects, or no goal."
             )
         return Finding(said, ASKS, numbers, " ".join(filter(None, limits)))
-
-    def part(name: str) -> str:
-        low, high = row[f"{name}_low"], row[f"{name}_high"]
-        return f"{100 * row[name]:.0f}%" + ("" if low is None else f" [{100 * low:.0f}, {100 * high:.0f}]")
-
-    attention = ", ".join(f"{100 * row[f'attention_{name}']:.0f}%" for name in names)
-    said = (
-        f"{_TAKEN[way]} {_does(units)}, {part(names[0])} lies on what the sentence names, {part(names[1])} on the "
-        f"robot, {part(names[2])} on neither (attention: {attention}). What is named covers "
-        f"{100 * row['area_named']:.1f}% of the pictures, the robot {100 * row['area_robot']:.0f}%."
+    areas = [row["area_named"], row["area_robot"], 1.0 - row["area_named"] - row["area_robot"]]
+    units_of_shares = (
+        (" of the attention", " of the area") if which == "all" else (" of attention's own tenth", " of the area")
     )
-    if which == "all":
-        said += f" Of the strongest tenth, {part('top_other')} is on neither."
+    parts: list[str] = []
+    for name, what, area in zip(names, _FROM, areas, strict=True):
+        attention = f"{100 * row[f'attention_{name}']:.0f}%"
+        joint = units_of_shares if not parts else ("", "")
+        beside = f"({attention}{joint[0]}, {_area(area)}{joint[1]})"
+        parts.append(f"{_share(row, name)} {'from' if parts else 'comes from'} {what} {beside}")
+    said = f"{_taken(question, way)}, and add up {_moved(units)}: {', '.join(parts)}."
+    if which == "all" and row["most_named"] is not None:
+        said += f" If only what is named moved it, blocks of this size would say {100 * row['most_named']:.0f}%."
+    if which == "all" and row["top_other"] is not None:
+        said += f" Of the strongest tenth, {_share(row, 'top_other')} is from the rest."
+    missing = len(question.selected) - row["num_episodes"]
+    limits += [f"Not known of {plural(missing, 'episode')}: no map, no coverage of objects or no goal."] * (missing > 0)
     return Finding(said, ASKS, numbers, " ".join(filter(None, limits)))
+
+
+_FROM = ("what the sentence names", "the robot", "the rest")
+
+
+def _share(row: Mapping[str, Any], name: str) -> str:
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return f"{100 * row[name]:.0f}%" + ("" if low is None else f" [{100 * low:.0f}, {100 * high:.0f}]")
+
+
+def _area(area: float) -> str:
+    return f"{100 * area:.1f}%" if area < 0.1 else f"{100 * area:.0f}%"
 
 
 def _named(named: Naming, units: ActionUnits, question: Question) -> Finding:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -39,8 +40,8 @@ def test_parts_of_the_strongest_tenth_are_sums_over_its_patches(store):
         cover = np.concatenate([opened.read(f"objects/{camera}") for camera in sorted_cameras(opened)], axis=1)
         parts = []
         for number, replan in enumerate(one.replan):
-            entries = [i for i, at in enumerate(one.patch_replan) if at == replan and not one.drawn[i]]
-            sizes = {one.patch[i]: abs(change[i]).mean() for i in entries}
+            entries = [(i, patch) for i, (at, patch, drawn) in enumerate(one.entries) if at == replan and not drawn]
+            sizes = {patch: abs(change[i]).mean() for i, patch in entries}
             top = sorted(sizes, key=lambda patch: -sizes[patch])[: round(0.1 * len(one.keys))]
             whole = sum(sizes[patch] for patch in top)
             of_named = sum(sizes[patch] * cover[number, patch, named].sum() for patch in top) / whole
@@ -57,7 +58,7 @@ def test_parts_of_the_strongest_tenth_are_sums_over_its_patches(store):
     patches = tables["maps"].shown
     assert patches.height == 18 * len(open_store(store).episodes[0].attributes.effects.map.keys)
     assert patches["exact"].drop_nulls().len() == sum(
-        len(one.attributes.effects.map.patch) for one in open_store(store).episodes
+        len(one.attributes.effects.map.entries) for one in open_store(store).episodes
     )
 
 
@@ -99,7 +100,7 @@ def test_parts_of_blocks_are_sums_over_all_of_them(blocks):
         cover = np.concatenate([opened.read(f"objects/{camera}") for camera in sorted_cameras(opened)], axis=1)
         attention = opened.read("joint/rows").astype(float).mean(axis=(1, 2, 3, 4))
         for number, replan in enumerate(one.replan):
-            sizes = {one.patch[i]: abs(change[i]).mean() for i, at in enumerate(one.patch_replan) if at == replan}
+            sizes = {patch: abs(change[i]).mean() for i, (at, patch, _) in enumerate(one.entries) if at == replan}
             of_key = cover[number][:, named].sum(axis=1)
             covers = {block: of_key[np.array(one.blocks) == block].mean() for block in sizes}
             read = {block: sum(attention[replan, key] for key, own in zip(one.keys, one.blocks, strict=True)
@@ -109,6 +110,8 @@ def test_parts_of_blocks_are_sums_over_all_of_them(blocks):
         found = [row["all_named"], row["attention_all_named"]]
         assert found == pytest.approx(np.mean(sums, axis=0), rel=1e-4)
         assert row["rank"] is None
+        patches = cover[:, :, named].sum(axis=2)
+        assert row["area_named"] == pytest.approx(patches.mean(), rel=1e-4)
     (finding,) = [one for one in findings if one.asks == ASKS]
     assert finding.numbers["named"] == pytest.approx(
         rows.group_by("task_id").agg(pl.mean("all_named"))["all_named"].mean()
@@ -139,6 +142,10 @@ def test_compare_has_the_parts_of_both_runs(tmp_path):
         each = tables_of(path)[0]["maps_episodes"].shown
         mean = each.group_by("task_id").agg(pl.mean("all_named"))["all_named"].mean()
         assert row[f"mean_{side}"] == pytest.approx(mean)
+    # Parts depend on the size of blocks: of other ones they are not compared.
+    plant = partial(planted_map, blocks=4)
+    other = write_store(tmp_path / "other.zarr", spec=replace(spec, plant_effects=plant))
+    assert "maps" not in {table.name for table in va.open(paths[0]).compare(other).tables}
 
 
 @pytest.mark.parametrize("times", [8.0, 0.1])

@@ -88,7 +88,7 @@ def test_pictures_have_the_map_s_values_and_marks_where_patches_were_taken_away(
         np.testing.assert_allclose(drawn, as_seen(lift, store, camera), rtol=1e-6)
         taken = np.zeros(lift.size, bool)
         first = one.keys.index(open_store(store).attributes.sites[0].patch_keys(camera)[0])
-        places = [patch for patch, of in zip(one.patch, one.patch_replan, strict=True) if of == replan]
+        places = [patch for of, patch, _ in one.entries if of == replan]
         taken[[patch - first for patch in places if first <= patch < first + lift.size]] = True
         marked = np.zeros(lift.shape, bool)
         for x, y in row["marks"]:
@@ -113,7 +113,7 @@ def test_the_table_has_the_map_and_the_exact_changes_of_effects(store):
         assert row["moves"] == pytest.approx(lift[row["row"], row["column"]])
         key = int(layout.patch_keys(row["camera"])[row["row"] * lift.shape[1] + row["column"]])
         assert row["exact"] == (None if known[row["replan"], key] is None else pytest.approx(known[row["replan"], key]))
-    assert patches["exact"].drop_nulls().len() == len(open_store(store).episodes[0].attributes.effects.map.patch)
+    assert patches["exact"].drop_nulls().len() == len(open_store(store).episodes[0].attributes.effects.map.entries)
 
 
 def test_the_count_of_patches_in_both_is_that_of_the_drawn_values(store):

@@ -93,9 +93,30 @@ def test_calls_whose_changes_cannot_be_used_have_an_order_alone(kind, monkeypatc
     assert (effects.map.sizes > 0).any()
 
 
-def test_fewer_denoise_steps_have_no_map():
+@pytest.mark.parametrize("items", ["map", "map:2x2"])
+def test_fewer_denoise_steps_and_other_readers_have_no_map(items):
     with pytest.raises(BadArgument, match="--effects-steps"):
-        measurement(policy_named("pi05"), items=("map",), denoise_steps=1)
+        measurement(policy_named("pi05"), items=(items,), denoise_steps=1)
+    with pytest.raises(BadArgument, match="readers"):
+        measurement(policy_named("pi05"), items=(items,), readers=("pictures", *(["action"] if items == "map" else [])))
+
+
+def test_a_map_of_blocks_without_a_call_is_none(monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    run = measurement(policy, items=("map:2x2",))
+    monkeypatch.setattr(run, "actions_of", lambda variants: {})
+    assert run.begin().measure(given, 11, actions, context).map is None
+
+
+def test_a_store_names_blocks_once_where_all_replans_have_the_same(tmp_path):
+    store = open_store(capture(tmp_path / "pi.zarr", "pi", "--effects", "map:2x2"))
+    for episode in store.episodes:
+        one = episode.attributes.effects.map
+        assert (one.patch, one.patch_replan, one.drawn) == (tuple(range(one.num_blocks)), (), ())
+        assert len(one.entries) == len(episode.read("effects/patch_change")) == len(one.replan) * one.num_blocks
+        sizes = np.sqrt((episode.read("effects/patch_change")[:, : one.steps].astype(float) ** 2).mean(axis=(1, 2)))
+        np.testing.assert_allclose(episode.read("effects/map").ravel(), sizes, rtol=1e-5)
 
 
 def test_policies_without_a_backward_pass_have_blocks_only(tmp_path, capsys):
