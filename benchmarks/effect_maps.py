@@ -92,20 +92,12 @@ class Maker:
 
     def sizes(self, given: Any, seed: int, groups: list[Any]) -> Any:
         """Root mean square change of the executed actions, normalised, without each group of keys."""
-        import numpy as np
+        from single_patches import sizes, without
 
-        from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
         from vla_attention.capture.policies.policy import CallVariant
 
-        variants = [CallVariant(given, seed, {})]
-        for keys in groups:
-            factors = np.ones(self.site.num_keys)
-            factors[keys] = 0.0
-            editor = SiteEditor(self.site.name, [SiteEdit("patches", "factor", factors, "all")])
-            variants.append(CallVariant(given, seed, {self.site.name: editor}))
-        made = np.stack(self.policy.act_variants(variants, self.model.config.num_denoise_steps, 64))
-        change = ((made[1:] - made[:1]) / self.policy.action_units())[:, : self.steps]
-        return np.sqrt((change**2).mean(axis=(1, 2)))
+        variants = [without(self.policy, given, seed, keys) for keys in groups]
+        return sizes(self.policy, CallVariant(given, seed), variants, self.steps)
 
     def gradients(self, given: Any, seed: int, whole: bool, count: int | None = None) -> Any:
         """Columns of the Jacobian by patch (output, patch), of all outputs or the first."""

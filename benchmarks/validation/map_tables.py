@@ -1,0 +1,143 @@
+"""The tables of `maps.py` in `docs/validation.md`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.validation.map_calls import MAPS
+from benchmarks.validation.policies import TITLES
+from benchmarks.validation.ranks import spearman
+from benchmarks.validation.tables import markdown
+from vla_attention.analyze.statistics.student import student_quantile
+
+#: Number -> what it is; the first ones are how far the action moves, the truth that the maps are held against.
+MOVES = {
+    "noise": "another noise seed",
+    "wrist_blank": "a grey wrist camera",
+    "mark_filled": "the mark taken out of the picture",
+    "other_mark": "another mark",
+    "prompt_other_colour": "another colour in the prompt",
+    "sentence moves": "the same, first call",
+    "mark moves": "another colour of the mark, first call",
+}
+#: What is read off every map, and the number of a map that shows nothing of it.
+PARTS = {
+    "wrist": "on the wrist camera",
+    "mark": "on the mark's patch",
+    "top": "strongest patch is the mark's",
+    "nmr": "top tenth on neither the named cubes nor the robot",
+    "named": "on the named cube, of named and other",
+    "sentence told": "on a cube when the sentence names it, of named and not",
+    "mark told": "on a cube when the mark names it, of named and not",
+}
+RANDOM = "random order"
+Numbers = Mapping[str, Sequence[float]]
+Results = Mapping[str, Any]
+
+
+def interval(values: Sequence[float] | None, digits: int = 2) -> str:
+    """The mean, and Student's t interval where there are several values."""
+    if not values:
+        return "-"
+    mean, number = float(np.mean(values)), len(values)
+    if number < 2:
+        return f"{mean:.{digits}f}"
+    half = student_quantile(0.95, number - 1) * float(np.std(values, ddof=1)) / number**0.5
+    return f"{mean:.{digits}f} [{mean - half:.{digits}f}, {mean + half:.{digits}f}]"
+
+
+def _with_number(values: Sequence[float]) -> str:
+    """The mean, and of how many."""
+    return f"{np.mean(values):.2f} ({len(values)})" if values else "-"
+
+
+def truths_table(results: Results) -> str:
+    """A row for each number, a column for each kind of policy."""
+    kinds = [kind for kind in TITLES if any(policy["control"] == kind for policy in results["policies"])]
+
+    def row(title: str, name: str) -> tuple[str, ...]:
+        of = [
+            [policy["numbers"].get(name) for policy in results["policies"] if policy["control"] == kind]
+            for kind in kinds
+        ]
+        return (title, *("; ".join(map(interval, own)) for own in of))
+
+    solved = [", ".join(f"{one['solved']}" for one in results["policies"] if one["control"] == kind) for kind in kinds]
+    rows = [(f"solved, of {results['policies'][0]['episodes']}", *solved)]
+    rows += [row(f"moves the action: {title}", name) for name, title in MOVES.items()]
+    rows += [
+        row(f"{title}: {of}", f"{part} {name}")
+        for part, title in PARTS.items()
+        for name, of in {"area": "part of the pictures", **MAPS}.items()
+    ]
+    return markdown(("", *(TITLES[kind] for kind in kinds)), (one for one in rows if set(one[1:]) != {"-"}))
+
+
+def curves_table(results: Results) -> str:
+    """A row for each map: how far the action moves without its best patches, or with them alone."""
+    numbers: Numbers = results["curves"]
+    ways = [(way, how) for how in ("tokens", "pixels") for way in ("deletion", "insertion")]
+    rows = [
+        (title, *(interval(numbers[f"{way} {how} {name}"], 3) for way, how in ways))
+        for name, title in (*MAPS.items(), ("random", RANDOM))
+    ]
+    said = {"deletion": "the best", "insertion": "all but the best"}
+    hidden = {"tokens": "hidden from all tokens", "pixels": "blurred in the picture"}
+    return markdown(("order of the patches by", *(f"{said[way]} {hidden[how]}" for way, how in ways)), rows)
+
+
+def levels_table(results: Results) -> str:
+    """The deletion curves of the tokens, at each level."""
+    numbers, levels = results["curves"], results["levels"]
+    rows = [
+        (title, *(f"{np.mean(numbers[f'deletion tokens {name} {i}']):.3f}" for i in range(len(levels))))
+        for name, title in (*MAPS.items(), ("random", RANDOM))
+    ]
+    return markdown(("the best by", *(f"{100 * level:.0f} %" for level in levels)), rows)
+
+
+def seeds_table(results: Results) -> str:
+    """A row for each map: its rank correlation with others of the same call."""
+    numbers = results["curves"]
+    rows = [
+        (title, *(interval(numbers[f"{part} {name}"]) for part in ("exact", "seed", "mean")))
+        for name, title in MAPS.items()
+    ]
+    return markdown(
+        ("map", "with exact knock-outs", "with itself, another seed", "with the mean of four other seeds"), rows
+    )
+
+
+def suites_table(results: Results) -> str:
+    """A row for each condition: success and NMR; the last row is over the conditions."""
+    rows = []
+    for one in results["suites"]:
+        numbers = one["numbers"]
+        outcomes = list(zip(numbers["episodes"], numbers["solved"], strict=True))
+        halves = [[nmr for nmr, solved in outcomes if solved == wanted] for wanted in (1.0, 0.0)]
+        rows.append(
+            (
+                one["title"],
+                f"{one['solved']} of {one['episodes']}",
+                interval(numbers["nmr"]),
+                *map(_with_number, halves),
+            )
+        )
+    parts = [one["solved"] / one["episodes"] for one in results["suites"]]
+    nmr = [float(np.mean(one["numbers"]["nmr"])) for one in results["suites"]]
+    if len(rows) > 2 and len(set(parts)) > 1:
+        rows.append(("rank correlation over the rows", "", f"{spearman(np.array(parts), np.array(nmr)):.2f}", "", ""))
+    return markdown(("what", "solved", "NMR@10", "of solved episodes", "of the others"), rows)
+
+
+def map_blocks(results: Results) -> dict[str, str]:
+    """The tables by their marks in the page."""
+    return {
+        "map truths": truths_table(results),
+        "map curves": f"{curves_table(results)}\n\n{levels_table(results)}",
+        "map seeds": seeds_table(results),
+        "map suites": suites_table(results),
+    }
