@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.validation.map_calls import MAPS
 from benchmarks.validation.policies import TITLES
@@ -38,9 +39,9 @@ Numbers = Mapping[str, Sequence[float]]
 Results = Mapping[str, Any]
 
 
-def interval(values: Sequence[float] | None, digits: int = 2) -> str:
+def interval(values: Sequence[float] | NDArray[np.float64] | None, digits: int = 2) -> str:
     """The mean, and Student's t interval where there are several values."""
-    if not values:
+    if values is None or not len(values):
         return "-"
     mean, number = float(np.mean(values)), len(values)
     if number < 2:
@@ -80,9 +81,14 @@ def curves_table(results: Results) -> str:
     """A row for each map: how far the action moves without its best patches, or with them alone."""
     numbers: Numbers = results["curves"]
     ways = [(way, how) for how in ("tokens", "pixels") for way in ("deletion", "insertion")]
-    rows = [
-        (title, *(interval(numbers[f"{way} {how} {name}"], 3) for way, how in ways))
-        for name, title in (*MAPS.items(), ("random", RANDOM))
+    of = {name: [np.array(numbers[f"{way} {how} {name}"]) for way, how in ways] for name in (*MAPS, "random")}
+    rows = [(title, *(interval(one, 3) for one in of[name])) for name, title in (*MAPS.items(), ("random", RANDOM))]
+    rows += [
+        (
+            f"{MAPS[name]}, minus exact",
+            *(interval(one - exact, 3) for one, exact in zip(of[name], of["exact"], strict=True)),
+        )
+        for name in list(MAPS)[1:]
     ]
     said = {"deletion": "the best", "insertion": "all but the best"}
     hidden = {"tokens": "hidden from all tokens", "pixels": "blurred in the picture"}
@@ -122,6 +128,7 @@ def suites_table(results: Results) -> str:
             (
                 one["title"],
                 f"{one['solved']} of {one['episodes']}",
+                interval(numbers["area"]),
                 interval(numbers["nmr"]),
                 *map(_with_number, halves),
             )
@@ -129,8 +136,9 @@ def suites_table(results: Results) -> str:
     parts = [one["solved"] / one["episodes"] for one in results["suites"]]
     nmr = [float(np.mean(one["numbers"]["nmr"])) for one in results["suites"]]
     if len(rows) > 2 and len(set(parts)) > 1:
-        rows.append(("rank correlation over the rows", "", f"{spearman(np.array(parts), np.array(nmr)):.2f}", "", ""))
-    return markdown(("what", "solved", "NMR@10", "of solved episodes", "of the others"), rows)
+        correlation = f"{spearman(np.array(parts), np.array(nmr)):.2f}"
+        rows.append(("rank correlation of success and NMR, over the rows", "", "", correlation, "", ""))
+    return markdown(("what", "solved", "part of the pictures", "NMR@10", "of solved episodes", "of the others"), rows)
 
 
 def map_blocks(results: Results) -> dict[str, str]:
