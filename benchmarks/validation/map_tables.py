@@ -21,19 +21,25 @@ MOVES = {
     "mark_filled": "the mark taken out of the picture",
     "other_mark": "another mark",
     "prompt_other_colour": "another colour in the prompt",
-    "sentence moves": "the same, first call",
+    "sentence moves": "another colour in the prompt, first call",
     "mark moves": "another colour of the mark, first call",
 }
-#: What is read off every map, and the number of a map that shows nothing of it.
+#: What is read off every map.
 PARTS = {
-    "wrist": "on the wrist camera",
-    "mark": "on the mark's patch",
-    "top": "strongest patch is the mark's",
-    "nmr": "top tenth on neither the named cubes nor the robot",
-    "named": "on the named cube, of named and other",
-    "sentence told": "on a cube when the sentence names it, of named and not",
-    "mark told": "on a cube when the mark names it, of named and not",
+    "wrist": "part on the wrist camera",
+    "mark": "part on the mark's patch",
+    "mark first": "part on the mark's patch, first call",
+    "top": "calls whose strongest patch is the mark's",
+    "top first": "first calls whose strongest patch is the mark's",
+    "tenth": "calls with the mark's patch in the top tenth",
+    "tenth first": "first calls with the mark's patch in the top tenth",
+    "nmr": "part of the top tenth on neither the named cubes nor the robot",
+    "named": "named against other cube",
+    "sentence told": "the same cube, named by the sentence against not named, first call",
+    "mark told": "the same cube, named by the mark against not named, first call",
 }
+#: Those of `PARTS` that are parts of all calls.
+COUNTS, ON_MARK = ("top", "tenth"), ("mark", "mark first")
 RANDOM = "random order"
 Numbers = Mapping[str, Sequence[float]]
 Results = Mapping[str, Any]
@@ -55,26 +61,40 @@ def _with_number(values: Sequence[float]) -> str:
     return f"{np.mean(values):.2f} ({len(values)})" if values else "-"
 
 
+def _kinds(results: Results) -> dict[str, list[Mapping[str, Any]]]:
+    """Kind of policy -> its trainings."""
+    found = {kind: [one for one in results["policies"] if one["control"] == kind] for kind in TITLES}
+    return {kind: own for kind, own in found.items() if own}
+
+
 def truths_table(results: Results) -> str:
-    """A row for each number, a column for each kind of policy."""
-    kinds = [kind for kind in TITLES if any(policy["control"] == kind for policy in results["policies"])]
+    """How far each change moves the action: a column for each kind of policy, a value for each training."""
+    kinds = _kinds(results)
+    rows = [("solved, of 12", *(", ".join(f"{one['solved']}" for one in own) for own in kinds.values()))]
+    for name, title in MOVES.items():
+        cells = ("; ".join(interval(one["numbers"].get(name)) for one in own) for own in kinds.values())
+        rows.append((title, *cells))
+    return markdown(("moves the action", *(TITLES[kind] for kind in kinds)), rows)
 
-    def row(title: str, name: str) -> tuple[str, ...]:
-        of = [
-            [policy["numbers"].get(name) for policy in results["policies"] if policy["control"] == kind]
-            for kind in kinds
-        ]
-        return (title, *("; ".join(map(interval, own)) for own in of))
 
-    solved = [", ".join(f"{one['solved']}" for one in results["policies"] if one["control"] == kind) for kind in kinds]
-    rows = [(f"solved, of {results['policies'][0]['episodes']}", *solved)]
-    rows += [row(f"moves the action: {title}", name) for name, title in MOVES.items()]
-    rows += [
-        row(f"{title}: {of}", f"{part} {name}")
-        for part, title in PARTS.items()
-        for name, of in {"area": "part of the pictures", **MAPS}.items()
-    ]
-    return markdown(("", *(TITLES[kind] for kind in kinds)), (one for one in rows if set(one[1:]) != {"-"}))
+def parts_table(results: Results) -> str:
+    """What is read off the maps: a row for each part and kind of policy, a column for each map."""
+
+    def cell(part: str, numbers: Numbers, name: str) -> str:
+        values = numbers[f"{part} {name}"]
+        if part.startswith(COUNTS):
+            return f"{100 * np.mean(values):.0f} %"
+        return interval(values, 3 if part in ON_MARK else 2)
+
+    rows = []
+    for part, title in PARTS.items():
+        for kind, own in _kinds(results).items():
+            known = [one["numbers"] for one in own if f"{part} exact" in one["numbers"]]
+            if known:
+                cells = ("; ".join(cell(part, numbers, name) for numbers in known) for name in MAPS)
+                rows.append((title, TITLES[kind], *cells))
+                title = ""
+    return markdown(("what is read off the map", "policy", *MAPS.values()), rows)
 
 
 def curves_table(results: Results) -> str:
@@ -145,6 +165,7 @@ def map_blocks(results: Results) -> dict[str, str]:
     """The tables by their marks in the page."""
     return {
         "map truths": truths_table(results),
+        "map parts": parts_table(results),
         "map curves": f"{curves_table(results)}\n\n{levels_table(results)}",
         "map seeds": seeds_table(results),
         "map suites": suites_table(results),

@@ -122,6 +122,13 @@ def nuisance(values: Array, call: Call) -> float:
     return 1.0 - float((values * covered(call))[chosen].sum() / values[chosen].sum())
 
 
+def on_mark(one: Array, call: Call, name: str, when: str = "") -> dict[str, float]:
+    """The mark's part of a map, and whether the strongest patch is its, or one of the strongest tenth."""
+    mark, order = call.covers[MARK] > 0, np.argsort(-one, kind="stable")
+    found = {f"mark{when} {name}": one[mark].sum() / one.sum(), f"top{when} {name}": float(mark[order[0]])}
+    return found | {f"tenth{when} {name}": float(mark[order[: round(TOP * len(one))]].any())}
+
+
 def against_truths(measured: Measured, store: Store, replans: int) -> dict[str, list[float]]:
     """What the maps show of the mark, the wrist camera and the named cube, beside how far the action moves."""
     values = Values()
@@ -142,9 +149,7 @@ def against_truths(measured: Measured, store: Store, replans: int) -> dict[str, 
             values.add(task, **{f"wrist {name}": one[measured.wrist].sum() / one.sum()})
             values.add(task, **{f"named {name}": share(named, other), f"nmr {name}": nuisance(one, call)})
             if MARK in call.covers:
-                mark = call.covers[MARK] > 0
-                found = {f"mark {name}": one[mark].sum() / one.sum(), f"top {name}": mark[one.argmax()]}
-                values.add(task, **found | {"mark area": mark.mean()})
+                values.add(task, **{"mark area": (call.covers[MARK] > 0).mean()}, **on_mark(one, call, name))
     return values.plain()
 
 
@@ -166,6 +171,8 @@ def told_otherwise(measured: Measured, store: Store, by: str) -> dict[str, list[
                 of = {each: on(np.clip(maps[each][name], 0.0, None), call.covers[f"{colour}_cube"]) for each in told}
                 not_named = [of[each] for each in of if each != colour]
                 values.add(scene, **{f"{by} told {name}": share(of[colour], float(np.mean(not_named)))})
+                if by == "mark":
+                    values.add(scene, **on_mark(np.clip(maps[colour][name], 0.0, None), call, name, " first"))
     return values.plain()
 
 
