@@ -74,11 +74,10 @@ CONDITIONS = (
     Suite("*lift* beside a yellow cube", "cubes", _YELLOW, 4),
     Suite("`cubes_harder`: put one cube on another", "cubes_harder", _PUT_ON, 2),
     Suite("agent picture moved by one patch", "cubes", _BASE, 1, ("--image", f"{BASE_CAMERA}=shifted:0,1"), 1),
-    Suite("agent picture moved by two patches", "cubes", _BASE, 1, ("--image", f"{BASE_CAMERA}=shifted:0,2"), 2),
-    Suite("agent picture moved by three patches", "cubes", _BASE, 1, ("--image", f"{BASE_CAMERA}=shifted:0,3"), 3),
     Suite("agent picture grey", "cubes", _BASE, 1, ("--image", f"{BASE_CAMERA}=blank")),
-    Suite("robot taken out of the wrist picture", "cubes", _BASE, 1, ("--image", f"{WRIST_CAMERA}=filled:robot")),
     Suite("an empty prompt", "cubes", _BASE, 1, ("--prompt", "empty")),
+    Suite("agent picture moved by two patches", "cubes", _BASE, 1, ("--image", f"{BASE_CAMERA}=shifted:0,2"), 2),
+    Suite("robot taken out of the wrist picture", "cubes", _BASE, 1, ("--image", f"{WRIST_CAMERA}=filled:robot")),
 )
 
 
