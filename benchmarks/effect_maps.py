@@ -94,21 +94,17 @@ class Maker:
 
     def sizes(self, given: Any, seed: int, groups: list[Any]) -> Any:
         """Root mean square change of the executed actions, normalised, without each group of keys."""
-        import numpy as np
+        from single_patches import sizes, without
 
-        from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
         from vla_attention.capture.policies.policy import CallVariant
 
-        variants = [CallVariant(given, seed, {})]
-        for keys in groups:
-            factors = np.ones(self.site.num_keys)
-            factors[keys] = 0.0
-            editor = SiteEditor(self.site.name, [SiteEdit("patches", "factor", factors, "all")])
-            variants.append(CallVariant(given, seed, {self.site.name: editor}))
-        return self._changes(variants)
+        variants = [without(self.policy, given, seed, keys) for keys in groups]
+        return sizes(self.policy, CallVariant(given, seed), variants, self.steps)
 
     def filled(self, given: Any, seed: int) -> Any:
         """The same with every patch's part of the picture filled from its surroundings."""
+        from single_patches import sizes
+
         from vla_attention.capture.effects.patch_maps import CallMap, picture_blocks
         from vla_attention.capture.policies.policy import CallVariant
         from vla_attention.schemas.effects import MapBlocks
@@ -118,14 +114,7 @@ class Maker:
         blocks = picture_blocks(self.policy, planned)
         made = CallMap(blocks, planned, dict.fromkeys(range(len(blocks)), False), None, self.steps, "all")
         variants = made.variants(self.policy, given, seed)
-        return self._changes([CallVariant(given, seed, {}), *(variants[i] for i in range(len(blocks)))])
-
-    def _changes(self, variants: list[Any]) -> Any:
-        import numpy as np
-
-        made = np.stack(self.policy.act_variants(variants, self.model.config.num_denoise_steps, 64))
-        change = ((made[1:] - made[:1]) / self.policy.action_units())[:, : self.steps]
-        return np.sqrt((change**2).mean(axis=(1, 2)))
+        return sizes(self.policy, CallVariant(given, seed), [variants[i] for i in range(len(blocks))], self.steps)
 
     def gradients(self, given: Any, seed: int, whole: bool, count: int | None = None) -> Any:
         """Columns of the Jacobian by patch (output, patch), of all outputs or the first."""

@@ -194,7 +194,7 @@ def call_map(
         shown = [place for place, block in enumerate(blocks) if is_shown[list(block.keys[site.name])].any()]
         reader: EffectReaders = "all" if "all" in planned.readers else "action"
         return CallMap(blocks, planned.blocks, dict.fromkeys(shown, False), None, steps, reader)
-    sizes, generator = _first_order(policy, policy_input, noise_seed, steps, horizon, seed)
+    sizes, generator = first_order(policy, policy_input, noise_seed, steps, horizon, seed)
     if not np.isfinite(sizes).all():
         return None
     seen = np.flatnonzero(is_shown[list(map_keys(policy))])
@@ -205,7 +205,7 @@ def call_map(
     return CallMap(single_patches(policy), None, chosen, sizes, steps, "all")
 
 
-def _first_order(
+def first_order(
     policy: Policy, policy_input: PolicyInput, noise_seed: int, steps: int, horizon: int, seed: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], np.random.Generator]:
     """Return the size of each patch (patch,), and the generator that drew the directions."""

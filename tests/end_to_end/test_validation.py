@@ -10,18 +10,24 @@ import numpy as np
 import pytest
 
 import benchmarks.validation.calls as validation_calls
+from benchmarks.validation import maps
 from benchmarks.validation.__main__ import main
 from benchmarks.validation.calls import changed_episodes, units_of
-from benchmarks.validation.changes import without
+from benchmarks.validation.changes import BASE_CAMERA, without
+from benchmarks.validation.map_calls import Measured, mask_scores, moved_cover
+from benchmarks.validation.map_tables import map_blocks
 from benchmarks.validation.numbers import NUMBERS
 from benchmarks.validation.policies import load_policy
 from benchmarks.validation.ranks import FAMILIES, spearman
-from benchmarks.validation.tables import fill_page
+from benchmarks.validation.tables import fill_marks, fill_page
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from tests.kit.questions import question_about
 from tests.kit.reruns import write_base
 from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
+from vla_attention.capture.interventions.changed_inputs import shifted
+from vla_attention.schemas.layout import PatchGrid
 from vla_attention.schemas.stores.reader import open_store
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,6 +56,19 @@ def test_units_leave_out_what_is_mostly_noise(tmp_path, monkeypatch):
     assert found.left_out == (3,)
     actions = np.concatenate([episode.read("actions").reshape(-1, 7) for episode in open_store(base).episodes])
     np.testing.assert_allclose(found.spread, actions.std(axis=0))
+
+
+def test_over_all_masks_the_score_of_a_patch_is_what_it_adds():
+    masks = np.array(list(np.ndindex((2,) * 4)), bool)
+    added = np.array([0.5, 0.0, 2.0, 0.1])
+    np.testing.assert_allclose(mask_scores(masks, masks @ added), added, atol=1e-12)
+
+
+def test_what_objects_cover_moves_with_the_picture():
+    cover = np.random.default_rng(0).integers(0, 2, (16, 3)).astype(np.float32)
+    grid = PatchGrid(4, 4, 4, 4)
+    picture = shifted(cover.reshape(4, 4, 3).astype(np.uint8), grid, 0, 1)
+    np.testing.assert_array_equal(moved_cover(cover, grid, 1), picture.reshape(16, 3))
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +121,26 @@ def test_effects_are_those_that_a_rerun_records(work, tmp_path):
     expected = {row["task_id"]: row["effect"] for row in table.iter_rows(named=True)}
     for episode in ours:
         assert episode.effect("words", found.spread).mean() == pytest.approx(expected[episode.task_id], rel=1e-4)
+
+
+@pytest.mark.simulator
+@pytest.mark.thorough
+def test_the_reduced_run_about_maps_has_every_table(work, tmp_path):
+    assert maps.main([str(work.parent / "policies"), "--work", str(work), "--reduced"]) == 0
+    results = json.loads((work / "maps.json").read_text())
+    assert [policy["control"] for policy in results["policies"]] == ["shipped", "words", "redundant"]
+    assert ["mark exact" in policy["numbers"] for policy in results["policies"]] == [False, False, True]
+    page = tmp_path / "page.md"
+    shutil.copy(ROOT / "docs" / "validation.md", page)
+    fill_marks(page, map_blocks(results))
+    assert "random blurred masks" in page.read_text()
+
+
+@pytest.mark.simulator
+@pytest.mark.thorough
+def test_the_mark_that_is_shown_again_is_the_one_that_was_shown(work):
+    store = open_store(work / "redundant_0" / "base.zarr")
+    measured = Measured(load_policy(store.path), 5)
+    for call in measured.calls(store, 1):
+        again = measured.told_otherwise(call, CUBE_TASKS[call.context.task_id].target, "mark")
+        np.testing.assert_array_equal(again.frames[BASE_CAMERA], call.given.frames[BASE_CAMERA])
