@@ -123,10 +123,10 @@ def _taken(question: Question, way: str) -> str:
     if way == "first order":
         return "Take the strongest tenth of the patches away, one at a time"
     one = next(found for item in question.selected if (found := map_of(item)) is not None and found.way == way)
-    grid = f"({' x '.join(map(str, one.grid))} a picture) " if one.grid else ""
+    blocks = f"each block of the pictures{f' ({one.grid[0]} x {one.grid[1]} each)' if one.grid else ''} in turn from"
     if way == "picture":
-        return f"Fill each block {grid}of the pictures in turn from its surroundings"
-    return f"Hide each block {grid}of the pictures in turn from {'all' if one.reader == 'all' else 'the action'} tokens"
+        return f"Fill {blocks} its surroundings"
+    return f"Hide {blocks} {'all' if one.reader == 'all' else 'the action'} tokens"
 
 
 def _parts(row: Mapping[str, Any], patches: pl.DataFrame, units: ActionUnits, question: Question) -> Finding:
