@@ -1,7 +1,7 @@
 """Whether a map of patches tells what moves the action, held against truths: the second part of docs/validation.md.
 
     python -m benchmarks.validation.maps POLICIES --work DIR --page docs/validation.md
-    python -m benchmarks.validation.maps POLICIES --work DIR --reduced      two tasks and few calls: under a minute
+    python -m benchmarks.validation.maps POLICIES --work DIR --reduced      two tasks and few calls: about a minute
 
 POLICIES and DIR are those of `python -m benchmarks.validation`, whose rollouts are used where they are there. What is
 in DIR already is not made again. Four maps of the patches of both cameras are made of a stored policy call: exact

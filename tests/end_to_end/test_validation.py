@@ -143,4 +143,6 @@ def test_the_mark_that_is_shown_again_is_the_one_that_was_shown(work):
     measured = Measured(load_policy(store.path), 5)
     for call in measured.calls(store, 1):
         again = measured.told_otherwise(call, CUBE_TASKS[call.context.task_id].target, "mark")
-        np.testing.assert_array_equal(again.frames[BASE_CAMERA], call.given.frames[BASE_CAMERA])
+        pictures = (one.frames[BASE_CAMERA].astype(int) for one in (again, call.given))
+        # The simulator's picture was made smaller, which mixes the mark's edge; another mark differs by 180 and more.
+        assert np.abs(np.subtract(*pictures)).max() < 90
