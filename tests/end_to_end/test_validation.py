@@ -120,7 +120,9 @@ def test_effects_are_those_that_a_rerun_records(work, tmp_path):
     ours = changed_episodes(policy, base, lambda episode: changes, 99, tmp_path / "calls", quiet)
     expected = {row["task_id"]: row["effect"] for row in table.iter_rows(named=True)}
     for episode in ours:
-        assert episode.effect("words", found.spread).mean() == pytest.approx(expected[episode.task_id], rel=1e-4)
+        (moved, *_) = found.units.parts
+        effect = moved.of(episode.base, episode.actions["words"], episode.executed)
+        assert effect.mean() == pytest.approx(expected[episode.task_id], rel=1e-4)
 
 
 @pytest.mark.simulator
