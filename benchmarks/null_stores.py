@@ -42,6 +42,7 @@ import vla_attention as va
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
 from tests.kit.planted_effects import planted_effects, planted_map
 from tests.kit.stores import StoreSpec, small_steps, write_store
+from vla_attention.analyze.commands.compare import NAMED_KINDS
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.core.listening import IN_PART, LISTENS_TO_ALL, listens
 from vla_attention.analyze.core.patch_maps import TRUSTED
@@ -131,7 +132,9 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
     numbers = {finding.asks: finding.numbers for finding in store.compare(paths[1]).findings}
     attention, looks = numbers.pop("And the attention?"), numbers.pop("Do they look for what is named?", {})
     tests = [float(p) for of in numbers.values() for name, p in of.items() if name.split("_")[0] == "p"]
-    named = [float(q) <= LEVEL / 7 for name, q in looks.items() if name.endswith("_ratio_q") and q is not None]
+    named = [
+        float(q) <= LEVEL / NAMED_KINDS for name, q in looks.items() if name.endswith("_ratio_q") and q is not None
+    ]
     return min(tests, default=1.0) <= LEVEL or any(attention.values()) or any(named)
 
 

@@ -32,8 +32,8 @@ _BETTER, _LISTEN, _MOVED, _NEEDS, _ATTENTION = (
     "And the attention?",
 )  # fmt: skip
 #: Kinds whose differences are named: effects, maps, groups, objects, words, heads; and of each run what it looks for.
-_KINDS = 7
-_SURE = pl.col("difference_q") <= NAMED_AT / _KINDS
+NAMED_KINDS = 7
+_SURE = pl.col("difference_q") <= NAMED_AT / NAMED_KINDS
 _MOST_NAMED = 3  # differences of a kind
 
 
@@ -59,7 +59,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
         if not part.other.run.repeats(first):
             findings += _behaved(part, told[first.name], told[part.name])
         findings += [*_needs(part), _attention(part)]
-    findings += of_runs({one.run.name: one.named for one in (base, *rest)}, NAMED_AT / _KINDS)
+    findings += of_runs({one.run.name: one.named for one in (base, *rest)}, NAMED_AT / NAMED_KINDS)
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
     about += [line for part in parts for line in _how_alike(part)]
     about += dict.fromkeys(line for run in runs for line in run.question.told)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.camera_maps import EpisodeMaps, PictureMap, upright, view_of
-from vla_attention.analyze.core.patch_maps import exact_changes
+from vla_attention.analyze.core.patch_maps import exact_changes, map_at_site
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.effects import MAP, MapWay
 from vla_attention.schemas.layout import Role
@@ -108,19 +108,18 @@ class EpisodeMoves:
 
 def has_map(item: SelectedEpisode) -> bool:
     """Whether an episode has a map of the patches of the site whose tokens it has."""
-    effects = item.episode.attributes.effects
-    return effects is not None and effects.map is not None and effects.map.site == item.tokens.layout.name
+    return map_at_site(item) is not None
 
 
 def episode_moves(item: SelectedEpisode, cameras: Sequence[str], units: ActionUnits) -> EpisodeMoves | None:
     """Read an episode's maps of some cameras, exact sizes in the first part of `units`; None where it has no map."""
-    effects = item.episode.attributes.effects
-    if not has_map(item) or effects is None or (one := effects.map) is None:
+    one = map_at_site(item)
+    if one is None:
         return None
     blocks = list(one.blocks or range(len(one.keys)))
     values = item.episode.read(MAP).astype(np.float64)[:, blocks]  # (map row, patch)
     keys, roles, layout = list(one.keys), item.tokens.static_roles, item.tokens.layout
-    sizes = exact_changes(item, one, units)[:, blocks]
+    sizes = exact_changes(item, one, units)[0][:, blocks]
     seen = roles[np.minimum(one.replan, len(roles) - 1)][:, keys] == Role.IMAGE
     if one.way != "first order":  # a block without an exact call has no size
         seen = seen & np.isfinite(sizes)

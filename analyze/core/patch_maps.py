@@ -18,7 +18,7 @@ can be trusted.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import polars as pl
@@ -56,10 +56,14 @@ def map_of(item: SelectedEpisode) -> EffectMap | None:
     return None if effects is None else effects.map
 
 
-def patch_maps(question: Question, units: ActionUnits, first: bool = False) -> pl.DataFrame:
-    """One row per block of every policy call with a map at the question's site that shows a part of a picture.
+def map_at_site(item: SelectedEpisode) -> EffectMap | None:
+    """The map of an episode, if it is of the site whose tokens it was selected with."""
+    one = map_of(item)
+    return None if one is None or one.site != item.tokens.layout.name else one
 
-    first: only of the first call of each episode.
+
+def patch_maps(question: Question, units: ActionUnits) -> pl.DataFrame:
+    """One row per block of every policy call with a map at the question's site that shows a part of a picture.
 
     Returns:
         suite, task_id, episode_index, success, replan, way (of `MapWay`), patch (place on the map's axis), key (the
@@ -69,36 +73,24 @@ def patch_maps(question: Question, units: ActionUnits, first: bool = False) -> p
         action queries to its keys; named, robot: the parts of it that what the sentence names and the robot cover, null
         where that is not known.
     """
-    frames = [_patches(question, item, one, units) for item in question.selected
-              if (one := map_of(item)) is not None and one.site == question.site]  # fmt: skip
-    frames = [one.filter(replan=0) for one in frames] if first else frames
+    frames = [
+        _patches(question, item, one, units) for item in question.selected if (one := map_at_site(item)) is not None
+    ]
     return pl.concat(frames) if frames else pl.DataFrame()
 
 
 def _patches(question: Question, item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> pl.DataFrame:
-    effects = item.episode.attributes.effects
-    assert effects is not None
     rows, patches = len(one.replan), one.num_blocks
-    rms, drawn = (np.full((rows, patches), np.nan) for _ in range(2))
-    exact, noise = exact_changes(item, one, units), _other_noise(item, one, units)
-    if one.entries:
-        of, patch, at_random = map(list, zip(*one.entries, strict=True))
-        row = np.searchsorted(one.replan, of)
-        normalised = item.episode.read(PATCH_CHANGE).astype(np.float64)
-        rms[row, patch] = np.sqrt((normalised[:, : one.steps] ** 2).mean(axis=(1, 2)))
-        drawn[row, patch] = at_random
+    exact, rms = exact_changes(item, one, units)
+    drawn = np.full((rows, patches), np.nan)
+    for replan, patch, at_random in one.entries:
+        drawn[one.replan.index(replan), patch] = at_random
     first = item.episode.read(MAP).astype(np.float64) if one.way == "first order" else np.full_like(exact, np.nan)
-    block = np.array(one.blocks or range(patches))
-    keys, number = np.array(one.keys), np.bincount(block)
-    # Of every block the sum over its keys: (..., key) @ (key, block).
-    of_block = np.zeros((len(keys), patches))
-    of_block[np.arange(len(keys)), block] = 1.0
-    calls = np.array(one.replan)
-    roles = item.tokens.static_roles
-    seen = ((roles[np.minimum(calls, len(roles) - 1)][:, keys] == Role.IMAGE) @ of_block > 0).ravel()
+    keys, calls, of_block = np.array(one.keys), np.array(one.replan), _of_block(one)
+    number = of_block.sum(axis=0).astype(np.int64)
     values = {"first_order": first, "exact": exact, "exact_rms": rms, "drawn": drawn,
               "floor": np.repeat(_floor(item, one)[:, None], patches, axis=1),
-              "noise": np.repeat(noise[:, None], patches, axis=1),
+              "noise": np.repeat(_other_noise(item, one, units)[:, None], patches, axis=1),
               "attention": mean_rows(question, item)[calls][:, keys] @ of_block}  # fmt: skip
     values |= {name: cover[calls][:, keys] @ of_block / number for name, cover in _covered(item).items()}
     columns = episode_columns(item, [*EPISODE_ID, "success"], rows * patches)
@@ -109,26 +101,53 @@ def _patches(question: Question, item: SelectedEpisode, one: EffectMap, units: A
                 "replan": np.repeat(calls.astype(np.int64), patches),
                 "way": [one.way] * (rows * patches),
                 "patch": np.tile(np.arange(patches), rows),
-                "key": np.tile(keys[np.unique(block, return_index=True)[1]], rows),
+                "key": np.tile(keys[of_block.argmax(axis=0)], rows),
                 "num_keys": np.tile(number, rows),
                 **{name: pl.Series(array.ravel(), nan_to_null=True) for name, array in values.items()},
             }
         )
         .with_columns(pl.col("drawn").cast(pl.Boolean))
-        .filter(pl.Series(seen))
+        .filter(pl.Series(_seen(item, one).ravel()))
     )
 
 
-def exact_changes(item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> Array:
-    """The exact change without each block, first part of `units`, (map row, block); NaN where no call was made."""
-    effects, found = item.episode.attributes.effects, np.full((len(one.replan), one.num_blocks), np.nan)
-    assert effects is not None
-    if one.entries:
-        of, patch, _ = zip(*one.entries, strict=True)
-        at = BaseEpisode.of(item).at(np.array(of, np.int64))
-        change = item.episode.read(PATCH_CHANGE).astype(np.float64) * np.array(effects.units)
-        found[np.searchsorted(one.replan, of), list(patch)] = units.changes(at, at.actions + change)[:, 0]
+def _of_block(one: EffectMap) -> Array:
+    """1 where a key is of a block, (key, block): (..., key) @ it is the sum over each block's keys."""
+    found = np.zeros((len(one.keys), one.num_blocks))
+    found[np.arange(len(one.keys)), np.array(one.blocks or range(one.num_blocks))] = 1.0
     return found
+
+
+def _seen(item: SelectedEpisode, one: EffectMap) -> NDArray[np.bool_]:
+    """Which blocks show a part of a picture, (map row, block)."""
+    roles = item.tokens.static_roles
+    is_image = roles[np.minimum(one.replan, len(roles) - 1)][:, list(one.keys)] == Role.IMAGE
+    found: NDArray[np.bool_] = is_image @ _of_block(one) > 0
+    return found
+
+
+def exact_changes(item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> tuple[Array, Array]:
+    """The exact change without each block, (map row, block) each; NaN where no call was made.
+
+    Returns:
+        in the first part of `units`; root mean square of the normalised actions.
+    """
+    sizes, rms = (np.full((len(one.replan), one.num_blocks), np.nan) for _ in range(2))
+    if one.entries:
+        replans, patches, _ = map(list, zip(*one.entries, strict=True))
+        change = item.episode.read(PATCH_CHANGE).astype(np.float64)
+        rows = np.searchsorted(one.replan, replans)
+        sizes[rows, patches] = _in_units(item, replans, change, units)
+        rms[rows, patches] = np.sqrt((change[:, : one.steps] ** 2).mean(axis=(1, 2)))
+    return sizes, rms
+
+
+def _in_units(item: SelectedEpisode, replans: Sequence[int], change: Array, units: ActionUnits) -> Array:
+    """The first part of `units` of changes (entry, horizon, dimension) as stored, at these replans, (entry,)."""
+    effects, at = item.episode.attributes.effects, BaseEpisode.of(item).at(np.array(replans, np.int64))
+    assert effects is not None
+    sizes: Array = units.changes(at, at.actions + change * np.array(effects.units))[:, 0]
+    return sizes
 
 
 def _other_noise(item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> Array:
@@ -140,10 +159,9 @@ def _other_noise(item: SelectedEpisode, one: EffectMap, units: ActionUnits) -> A
         if effects.items[number].change == "noise" and replan in one.replan
     ]  # fmt: skip
     if entries:
-        of = np.array(effects.replan)[entries]
-        at = BaseEpisode.of(item).at(of.astype(np.int64))
-        change = item.episode.read(CHANGE)[entries].astype(np.float64) * np.array(effects.units)
-        found[np.searchsorted(one.replan, of)] = units.changes(at, at.actions + change)[:, 0]
+        replans = [effects.replan[i] for i in entries]
+        change = item.episode.read(CHANGE)[entries].astype(np.float64)
+        found[np.searchsorted(one.replan, replans)] = _in_units(item, replans, change, units)
     return found
 
 
@@ -256,16 +274,18 @@ def summary_of_maps(episodes: pl.DataFrame, question: Question, by: Collection[s
     return estimate(episodes, kept, scales, question.sampling)
 
 
-def named_in_maps(question: Question, patches: pl.DataFrame) -> Naming:
+def named_in_maps(question: Question, units: ActionUnits) -> Naming:
     """Named against not named, as `core.naming`: of each object its part of the sizes, in maps of blocks."""
-    first = patches.filter(pl.col("way") != "first order", replan=0).partition_by(EPISODE_ID, as_dict=True)
     rows = []
     for item in question.selected:
-        one, call, cover = map_of(item), first.get(item.key), _coverage(item, slice(1))
-        if one is None or call is None or cover is None or call["exact"].null_count():
+        one, cover = map_at_site(item), _coverage(item, slice(1))
+        if one is None or one.way == "first order" or cover is None or 0 not in one.replan:
             continue
-        sizes = np.zeros(one.num_blocks)
-        sizes[call["patch"]] = call["exact"] * (call["exact_rms"] > call["floor"])
+        first = one.replan.index(0)
+        (exact, rms), seen = exact_changes(item, one, units), _seen(item, one)[first]
+        if np.isnan(exact[first, seen]).any():
+            continue
+        sizes = np.where(seen & (rms[first] > _floor(item, one)[first]), exact[first], 0.0)
         of_key = (sizes / np.bincount(one.blocks))[list(one.blocks)]
         parts = of_key @ cover[0, list(one.keys)] / max(sizes.sum(), np.finfo(float).tiny)
         rows += [
@@ -273,6 +293,6 @@ def named_in_maps(question: Question, patches: pl.DataFrame) -> Naming:
             for thing, part in zip(item.tokens.objects, parts, strict=True)
             if part > 0
         ]
-    schema = {name: patches.schema[name] for name in EPISODE_ID}
-    schema |= {"item": pl.String(), "camera": pl.String(), "x": pl.Float64()}
+    schema = {"suite": pl.String, "task_id": pl.Int64, "episode_index": pl.Int64, "item": pl.String,
+              "camera": pl.String, "x": pl.Float64}  # fmt: skip
     return in_same_states(question, pl.DataFrame(rows, schema, orient="row"))

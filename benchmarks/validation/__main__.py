@@ -39,11 +39,10 @@ def main(argv: list[str] | None = None) -> int:
     )
 
 
-def _run(argv: list[str] | None) -> int:
+def read_arguments(argv: list[str] | None, module: str, says: str | None) -> argparse.Namespace:
+    """What the studies of trained policies are told: policies, work, page, reduced."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.validation",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        prog=f"python -m {module}", description=says, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("policies", type=Path, metavar="POLICIES", help="folder of trained policies")
     parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="folder of stores and results")
@@ -51,7 +50,11 @@ def _run(argv: list[str] | None) -> int:
         "--page", type=Path, metavar="FILE", help="write tables into this page, and their rows beside us"
     )
     parser.add_argument("--reduced", action="store_true", help="two tasks, ten steps, one policy call of each episode")
-    given = parser.parse_args(argv)
+    return parser.parse_args(argv)
+
+
+def _run(argv: list[str] | None) -> int:
+    given = read_arguments(argv, "benchmarks.validation", __doc__)
     policies = [KnownPolicy(SHIPPED, "pi05_cubes", "cubes", SHIPPED), *read_policies(given.policies)]
     tasks, replans, steps = ([0, 4], 1, 10) if given.reduced else (list(range(NUM_BASE_TASKS)), 2, 100)
     results = run(policies, given.work, tasks, replans, steps)

@@ -12,7 +12,6 @@ mean change of the action with masks that blur it minus that of the others; scor
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -27,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.single_patches import sizes, without
-from benchmarks.validation.__main__ import say
+from benchmarks.validation.__main__ import read_arguments, say
 from benchmarks.validation.changes import BASE_CAMERA, NEXT_COLOUR, WRIST_CAMERA, known_changes
 from benchmarks.validation.map_calls import MAPS, Call, Measured
 from benchmarks.validation.map_tables import map_blocks
@@ -282,18 +281,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(argv: list[str] | None) -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.validation.maps",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("policies", type=Path, metavar="POLICIES", help="folder of trained policies")
-    parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="folder of stores and results")
-    parser.add_argument(
-        "--page", type=Path, metavar="FILE", help="write the tables into this page, and their numbers beside us"
-    )
-    parser.add_argument("--reduced", action="store_true", help="two tasks, ten steps, one policy call of each episode")
-    given = parser.parse_args(argv)
+    given = read_arguments(argv, "benchmarks.validation.maps", __doc__)
     policies = [KnownPolicy(SHIPPED, "pi05_cubes", "cubes", SHIPPED), *read_policies(given.policies)]
     results = run(policies, given.work, Extent((0, 4), 1, 1, 10, 10, 1) if given.reduced else Extent())
     text = json.dumps(results, indent=1) + "\n"

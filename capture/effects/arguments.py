@@ -17,7 +17,8 @@ GROUPING = "grouping:"
 #: Prompt tables: the one that is made of the tasks, and the beginning of one that names a file.
 STANDARD, TABLE = "standard", "table:"
 #: What effects can be of, as it is typed; a map in one of three forms.
-ITEMS = ("text", "cameras", "objects", "tokens", "map", "map:8x8", "map:picture:8x8", f"{GROUPING}FILE")
+_PLAIN = ("text", "cameras", "objects", "tokens")
+ITEMS = (*_PLAIN, "map", "map:8x8", "map:picture:8x8", f"{GROUPING}FILE")
 _MAP = re.compile(r"map(?::(?P<picture>picture:)?(?P<rows>\d{1,3})x(?P<columns>\d{1,3}))?")
 
 
@@ -89,7 +90,7 @@ class EffectSettings:
         maps = tuple(dict.fromkeys(word for word in self.items if _MAP.fullmatch(word)))
         if len(maps) > 1:
             raise BadArgument(f"Effects (--effects) take one map, not {listing(maps)}.")
-        for name, known in (("items", (*ITEMS[:4], *maps, *groupings)), ("readers", get_args(EffectReaders))):
+        for name, known in (("items", (*_PLAIN, *maps, *groupings)), ("readers", get_args(EffectReaders))):
             words = getattr(self, name)
             for word in words:
                 if word not in known:

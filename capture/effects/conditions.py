@@ -80,13 +80,13 @@ def effects_recorded(
     settings: EffectSettings, sites: Sequence[SiteLayout], denoise_steps: int, seed: int
 ) -> EffectsRecorded:
     """Return the effects of settings at these sites, with the selectors of the grouping's groups."""
-    items: list[EffectItems] = [item for item in get_args(EffectItems) if item in settings.items and item != "map"]
+    kinds = {word.partition(":")[0] for word in settings.items}
+    items: list[EffectItems] = [item for item in get_args(EffectItems) if item in kinds]
     groups = {} if settings.grouping is None else _groups_of(settings.grouping, sites)
     items += ["groups"] if groups else []
     if settings.prompts and not settings.rows:
         raise BadArgument(f"Cannot use --prompts {settings.prompts} here, where no task is known yet; use a rerun.")
     items += ["prompts"] if settings.rows else []
-    items += ["map"] if settings.map_form else []
     return EffectsRecorded(
         tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows, settings.blocks,
         settings.controls,

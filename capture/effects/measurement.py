@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import UNCHANGED, conditions_of
 from vla_attention.capture.effects.mean_pictures import MeanPictures
-from vla_attention.capture.effects.patch_maps import DRAWN, PROJECTIONS, STRONGEST, CallMap, call_map, picture_blocks
+from vla_attention.capture.effects.patch_maps import (
+    DRAWN,
+    PROJECTIONS,
+    STRONGEST,
+    CallMap,
+    PictureBlock,
+    call_map,
+    map_blocks,
+)
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.factors import QueryWithoutKeys, SiteEditor
 from vla_attention.capture.interventions.resolution import (
@@ -100,7 +108,7 @@ class EffectMeasurement:
     def _price_of_map(self) -> str:
         blocks = self.planned.blocks
         if blocks is not None:
-            number, how = len(picture_blocks(self.policy, blocks)), blocks.describe()
+            number, how = len(self.blocks), blocks.describe()
             alone = " Each block is one patch." if number == len(map_keys(self.policy)) else ""
             return (
                 f"Map: {plural(number, 'changed call')} a policy call; in each a block of the pictures is {how}.{alone}"
@@ -114,6 +122,11 @@ class EffectMeasurement:
     def begin(self) -> EpisodeEffectsMeasured:
         """Return what measures one episode."""
         return EpisodeEffectsMeasured(self)
+
+    @cached_property
+    def blocks(self) -> Sequence[PictureBlock]:
+        """Of the map."""
+        return map_blocks(self.planned, self.policy)
 
     @cached_property
     def units(self) -> NDArray[np.float64]:
@@ -324,7 +337,7 @@ class EpisodeEffectsMeasured:
         steps = min(self.run.executed or policy.default_replan_steps or horizon, horizon)
         seed = (self.run.planned.seed % 2**32, context.task_id, context.episode_index, context.replan)
         try:
-            found = call_map(planned, policy, policy_input, noise_seed, steps, horizon, seed)
+            found = call_map(planned, self.run.blocks, policy, policy_input, noise_seed, steps, horizon, seed)
         except torch.OutOfMemoryError:
             torch.cuda.empty_cache()
             self.run.say_once("The memory does not suffice for the backward passes of a call: no map is made.")

@@ -178,19 +178,23 @@ class CallMap:
         return ReplanMap(form, sizes, tuple(kept), tuple(self.chosen[place] for place in kept), change)
 
 
+def map_blocks(planned: EffectsRecorded, policy: Policy) -> list[PictureBlock]:
+    """Return the blocks of a run's map, which are the same at all of its calls."""
+    return single_patches(policy) if planned.blocks is None else picture_blocks(policy, planned.blocks)
+
+
 def call_map(
-    planned: EffectsRecorded, policy: Policy, policy_input: PolicyInput, noise_seed: int, steps: int, horizon: int,
-    seed: tuple[int, ...],
+    planned: EffectsRecorded, blocks: Sequence[PictureBlock], policy: Policy, policy_input: PolicyInput,
+    noise_seed: int, steps: int, horizon: int, seed: tuple[int, ...],
 ) -> CallMap | None:  # fmt: skip
     """Return what is measured of a call; None where its first order is not finite.
 
-    steps: of the chunk of `horizon` actions that are executed. seed: of the directions, and of the patches that are
-    drawn.
+    blocks: `map_blocks`. steps: of the chunk of `horizon` actions that are executed. seed: of the directions, and of
+    the patches that are drawn.
     """
     site = map_site(policy)
     is_shown = policy_input.key_role[site.name] == Role.IMAGE
     if planned.blocks is not None:
-        blocks = picture_blocks(policy, planned.blocks)
         shown = [place for place, block in enumerate(blocks) if is_shown[list(block.keys[site.name])].any()]
         reader: EffectReaders = "all" if "all" in planned.readers else "action"
         return CallMap(blocks, planned.blocks, dict.fromkeys(shown, False), None, steps, reader)
@@ -202,7 +206,7 @@ def call_map(
     strongest = round(STRONGEST * len(seen))
     chosen = {int(place): False for place in by_size[:strongest]}
     chosen |= {int(place): True for place in generator.permutation(by_size[strongest:])[:DRAWN]}
-    return CallMap(single_patches(policy), None, chosen, sizes, steps, "all")
+    return CallMap(blocks, None, chosen, sizes, steps, "all")
 
 
 def first_order(

@@ -47,9 +47,8 @@ def maps_where_recorded(question: Question, only_named: bool = False) -> tuple[l
         return [Finding(f"Not shown: {error}", ASKS)], []
     if found is None or not only_named:
         return ([], []) if found is None else of_maps(question, found.units)
-    patches = patch_maps(question, found.units, first=True)
-    named = None if patches.is_empty() else named_in_maps(question, patches)
-    return ([], []) if named is None or named.form is None else ([_named(named, found.units, question)], [])
+    named = named_in_maps(question, found.units)
+    return ([] if named.form is None else [_named(named, found.units, question)]), []
 
 
 def of_maps(question: Question, units: ActionUnits, by: Collection[str] = ()) -> tuple[list[Finding], list[Table]]:
@@ -66,10 +65,10 @@ def of_maps(question: Question, units: ActionUnits, by: Collection[str] = ()) ->
         ], []
     calls = calls_of_maps(patches, question)
     episodes = episodes_of_maps(calls)
-    summary, named = summary_of_maps(episodes, question), named_in_maps(question, patches)
+    summary, named = summary_of_maps(episodes, question), named_in_maps(question, units)
     which = "all" if summary["all_named"].count() else "top"
     title = "All blocks" if which == "all" else "The strongest tenth of the patches"
-    kept = [column for column in columns_of(by) if column.name in (*calls.columns,)]
+    kept = [column for column in columns_of(by) if column.name in calls.columns]
     known = calls[f"{which}_named"].count() > 0
     shown = _columns(_OF_EPISODE, which, calls) if known and not kept else []
     tables = [Table("maps_episodes", episodes, shown, title, rows=8)]
@@ -137,10 +136,9 @@ def _parts(row: Mapping[str, Any], patches: pl.DataFrame, units: ActionUnits, qu
     numbers = {"way": way, **{part: row[name] for part, name in zip(_PARTS, names, strict=True)},
                "most_named": row["most_named"], "nmr10": row["top_other"], "median": row["median"],
                "noise": row["noise"], "rank": row["rank"], "rank_low": row["rank_low"]}  # fmt: skip
-    sizes = "" if row["noise"] is None else f"Another noise seed does {units.short(row['noise'])}"
-    if row["median"] is not None:
-        sizes = f"The median block does {units.short(row['median'])}{sizes.replace('Another', ', another')}"
-    sizes += "." if sizes else ""
+    yardsticks = {"median": "the median block does", "noise": "another noise seed does"}
+    done = ", ".join(f"{what} {units.short(row[name])}" for name, what in yardsticks.items() if row[name] is not None)
+    sizes = f"{done[0].upper()}{done[1:]}." if done else ""
     limits = [_order(row) if way == "first order" else "", sizes, _LIMITS[way], enough(question)]
     if row[names[0]] is None:
         said = "No single patch is found to move the action."
