@@ -37,6 +37,14 @@ def question_parser(name: str) -> OneSentenceParser:
     if command.runs:
         runs = "STORE, or NAME=STORE[,STORE ...] for a run of several stores; two or more"
         parser.add_argument("runs", nargs="+", metavar="RUN", help=runs)
+    elif command.data:
+        what = "a LeRobotDataset: a folder, ORG/NAME or ORG/NAME@REVISION of the hub; or a store NAME.zarr"
+        parser.add_argument("place", metavar="DATA", help=what)
+        parser.add_argument(
+            "--num-episodes", type=int, metavar="N", help="read N episodes, evenly over all (default: 5000 at most)"
+        )
+        add_output(parser, name)
+        return parser
     else:
         parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     parser.instead = INSTEAD
@@ -49,6 +57,12 @@ def run_question(name: str, given: argparse.Namespace) -> int:
     """Answer a question: files, and what fits a screen; returns the exit code."""
     from vla_attention.schemas.stores.reader import open_store
 
+    if COMMANDS[name].data:
+        from vla_attention.analyze.commands.data import data
+        from vla_attention.analyze.core.data_episodes import read_episodes
+
+        folder = given.output or results_folder([Path(given.place)], name, given)
+        return _show(data(read_episodes(given.place, given.num_episodes)), folder, given)
     own = {option: getattr(given, option) for option in COMMANDS[name].options if option not in (*_settings(), "open")}
     if COMMANDS[name].runs:
         from vla_attention.analyze.core.runs import parse_runs

@@ -19,6 +19,7 @@ class Command:
         keeps: whether it keeps stores instead of asking them; its parser has all of its options.
         page: whether its function gives several results, which are one HTML file.
         runs: whether it takes runs, each of one or several stores, instead of the stores of one.
+        data: whether it takes a data set, or one store, instead of stores.
     """
 
     answers: str
@@ -30,6 +31,7 @@ class Command:
     keeps: bool = False
     page: bool = False
     runs: bool = False
+    data: bool = False
 
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
@@ -49,6 +51,11 @@ COMMANDS: dict[str, Command] = {
             "analyze runs/libero_10.zarr --group bowl=object:bowl_1 --group noun=word:bowl --ratio bowl/noun",
             "analyze runs/libero_10.zarr --list",
         ),
+    ),
+    "data": Command(
+        "before training: do the data ask for the sentence, or does the first picture tell it",
+        examples=("data ORG/NAME", "data data/so101_pick --num-episodes 500", "data runs/cubes.zarr"),
+        data=True,
     ),
     "language": Command(
         "does it listen: what it was told and did, which words decide, and which are read",

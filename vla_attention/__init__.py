@@ -8,7 +8,7 @@
     with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/my-policy.md
         ...
 
-Public names: `open`, `example`, `workers`, `OpenStores` and `language_test` (stage two); `record`, `inspect`,
+Public names: `open`, `data`, `example`, `workers`, `OpenStores` and `language_test` (stage two); `record`, `inspect`,
 `check_layout`, `layouts`, the parts of a `PolicyLayout`, `EffectSettings`, `Interventions` and `knockout` (stage one,
 from your own code; it needs torch); `UserError` (the base of every error that a user can cause) and `__version__`.
 `vla_attention.datasets` reads data sets of robots. This import loads neither torch nor zarr, polars or numpy.
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from vla_attention import datasets as datasets
     from vla_attention.analyze.api import OpenStores as OpenStores
     from vla_attention.analyze.language_test import language_test as language_test
+    from vla_attention.analyze.render.answer import Answer
     from vla_attention.capture.effects.arguments import EffectSettings as EffectSettings
     from vla_attention.capture.torch_policies import layouts as layouts
     from vla_attention.capture.torch_policies.inspect_calls import CallTable
@@ -62,7 +63,7 @@ _RECORDER = {
     "schemas.layout": ("PatchGrid", "SiteLayout", "Span"),
 }
 
-__all__ = ["OpenStores", "UserError", "__version__", "example", "inspect", "language_test", "open", "workers"]
+__all__ = ["OpenStores", "UserError", "__version__", "data", "example", "inspect", "language_test", "open", "workers"]
 
 
 def __dir__() -> list[str]:
@@ -84,6 +85,27 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     from vla_attention.analyze.api import open_stores
 
     return open_stores(stores)
+
+
+def data(place: str | Path, num_episodes: int | None = None) -> Answer:
+    """Return what the first pictures of a data set tell of its sentences, before anything is trained on it.
+
+    `place`: a LeRobotDataset (a folder, `ORG/NAME` or `ORG/NAME@REVISION`) or a store. `num_episodes`: so many, evenly
+    over all; 5,000 at most without it. Tables "pairs", "words", "looks" and "ways".
+
+    >>> va.data(store)["ways"]["sentence"].len()
+    2
+
+    Raises:
+        DataSetError, StoreError: it cannot be read.
+        BadArgument: it has no pictures, or fewer than two sentences.
+    """
+    # Imported here: `import vla_attention` loads neither polars nor numpy.
+    from vla_attention.analyze.commands.data import data as answer
+    from vla_attention.analyze.core.data_episodes import read_episodes
+    from vla_attention.analyze.render.answer import Answer
+
+    return Answer.of(answer(read_episodes(place, num_episodes)))
 
 
 def example(name: str) -> Path:

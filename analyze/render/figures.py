@@ -11,7 +11,8 @@ The options of a figure, by kind:
     stacked       x, value, color: a column of parts, which are stacked in their order. mean: the x of all others
                   together, drawn apart, whose values the legend says. num_episodes. ylabel, xlabel.
     distribution  x, value: a box for each x, with a dot for each row. uniform, log, xlabel, ylabel.
-    heat_map      x, y, value: factors around 1, or shares with share=True. xlabel, ylabel, label.
+    heat_map      x, y, value: factors around 1, or shares with share=True, from `low` on. xlabel, ylabel,
+                  label. beside: y -> a picture (row, column, 3), which stands left of its row.
     scatter       x, y, label: points with names, y_low and y_high as bars; both axes are logarithmic. color, colors,
                   names, baseline (of y), baseline_name: as of a forest. x_baseline, xlabel, ylabel.
     pictures      see `render.pictures`.
@@ -410,7 +411,7 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     known = factors[np.isfinite(factors) & (factors > 0)]
     most = float(np.maximum(known, 1 / known).max(initial=_LEAST_FACTOR))
     shares = bool(o.get("share"))
-    low, high = (0.0, 1.0) if shares else (1 / most, most)
+    low, high = (o.get("low", 0.0), 1.0) if shares else (1 / most, most)
     shown, scale = np.clip(factors, low, high), Normalize(low, high) if shares else LogNorm(low, high)
     stops, written = (_STOPS[2:], _percent) if shares else (_STOPS, _factor)
     colors = LinearSegmentedColormap.from_list("less_more", stops).with_extremes(bad=_NO_VALUE)
@@ -432,6 +433,13 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     label_positions(axes.yaxis, [str(one) for one in lines], _MOST_LABELS)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
+    if beside := o.get("beside"):
+        for row, line in enumerate(lines):
+            corner = axes.inset_axes((-0.1, row / len(lines), 0.09, 0.92 / len(lines)))
+            corner.imshow(beside[line])
+            corner.set_axis_off()
+        axes.tick_params(axis="y", pad=34)
+        return 0.9 + min(8.0, 0.42 * len(lines))
     return 0.9 + min(6.0, 0.3 * len(lines))
 
 

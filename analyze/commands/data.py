@@ -1,0 +1,525 @@
+"""Do the data ask for the sentence? What the first picture tells of it, before anything is trained.
+
+A policy that is trained where the picture says what to do need not read. Asked are: how often the sentence is told from
+the first picture; which sentences are told in scenes that look alike; which words vary there; whether the actions
+differ where the pictures do not; and in how many ways the same is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from vla_attention.analyze.core.data_episodes import DataEpisodes, looks_of_motion
+from vla_attention.analyze.core.exchanged import KINDS, words_by_kind
+from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
+from vla_attention.analyze.statistics.many_looks import NAMED_AT, adjusted_p_values
+from vla_attention.analyze.statistics.told_apart import Labels, Share, Told, enough, tell, tell_apart
+from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.progress_bar import progress_bar
+from vla_attention.schemas.safe_text import visible
+
+#: Sentences of fewer episodes are left out; of more sentences than this, those of most episodes are compared in pairs.
+FEWEST, MOST_SENTENCES = 5, 150
+#: Told apart in less than this share of episodes, scenes count as shared: half of the way from guessing to knowing.
+LIMIT = 0.75
+#: From this share on, the picture tells the sentence.
+TELLS = 0.9
+SHARED, APART, OPEN = "share scenes", "told apart", "not known"
+#: Pairs whose actions are compared, and names in a sentence.
+_MOST_PAIRS, _NAMES = 60, 4
+_MUST, _WHERE, _WORDS, _BY_WHAT = "Must a policy read the sentence here?", "Where must it?", "Which words?", "By what?"
+_ACTIONS, _WAYS, _FAULTS = "Do the demonstrations differ there?", "Is it said in more than one way?", "Faults?"
+_WEAK = "A network may see more than this look: small pictures (8 x 8 colours and edges) and the first state."
+
+
+@dataclass(frozen=True)
+class _Sentences:
+    """The sentences that are compared, those of most episodes first: names as written, and episodes (sentence,)."""
+
+    names: tuple[str, ...]
+    keys: tuple[str, ...]
+    members: tuple[Labels, ...]
+
+    @classmethod
+    def of(cls, data: DataEpisodes) -> _Sentences:
+        counts = Counter(sentence for sentence in data.sentences if sentence)
+        keys = tuple(key for key, number in counts.most_common() if number >= FEWEST)
+        told = np.array(data.sentences, dtype=object)
+        names = tuple(visible(data.written[key].most_common(1)[0][0]) for key in keys)
+        return cls(names, keys, tuple(np.flatnonzero(told == key) for key in keys))
+
+    @property
+    def num_episodes(self) -> int:
+        return sum(map(len, self.members))
+
+
+def data(episodes: DataEpisodes) -> Result:
+    """What the beginnings of episodes tell of their sentences.
+
+    Raises:
+        BadArgument: fewer than two sentences are told.
+    """
+    told = [sentence for sentence in episodes.sentences if sentence]
+    if len(set(told)) < 2:
+        raise BadArgument(
+            f"'{episodes.name}' tells {plural(len(set(told)), 'sentence')} in {plural(len(told), 'episode')}; expected "
+            "two or more: with one there is nothing to tell apart."
+        )
+    sentences = _Sentences.of(episodes)
+    figures: list[Figure] = []
+    by_word = len(sentences.keys) < 2 or 2 * sentences.num_episodes < len(told)
+    if by_word:
+        words = _words_by_picture(episodes)
+        findings, tables = [_asked_by_word(words, episodes)], [_word_table(words)]
+    else:
+        findings, tables, figures = _by_sentence(episodes, sentences)
+    ways = _ways(episodes)
+    left = len(told) - sentences.num_episodes
+    notes = [
+        f"{plural(left, 'episode')} of {plural(len(set(told)) - len(sentences.keys), 'sentence')} left out: told in "
+        f"fewer than {FEWEST} episodes."
+    ] if left and not by_word else []  # fmt: skip
+    return Result(
+        "Do the data ask for the sentence?",
+        _about(episodes, len(set(told))),
+        [*findings, _said_in_ways(ways), *_faults(episodes)],
+        [*tables, Table("ways", ways, _WAY_COLUMNS, "What is said, and in how many ways")],
+        figures,
+        notes,
+    )
+
+
+def _about(episodes: DataEpisodes, number: int) -> list[str]:
+    read = len(episodes.sentences)
+    part = f"{read} of {episodes.total} episodes, evenly spread" if read < episodes.total else plural(read, "episode")
+    state = f", and the first state ({episodes.state})" if episodes.state else ""
+    return [
+        f"{visible(episodes.name)}: {part}, {plural(number, 'sentence')}. Looked at: the first picture of "
+        f"{listing(episodes.cameras)}{state}."
+    ]
+
+
+def _by_sentence(episodes: DataEpisodes, sentences: _Sentences) -> tuple[list[Finding], list[Table], list[Figure]]:
+    chosen = np.concatenate(sentences.members)
+    order = np.argsort(chosen)
+    groups = np.repeat(np.arange(len(sentences.keys)), [len(one) for one in sentences.members])[order]
+    found = tell({name: look.of(chosen[order]) for name, look in episodes.looks.items()}, groups)
+    pairs = _pairs(episodes, sentences)
+    shared = _groups(pairs, sentences)
+    words = _words_by_pairs(pairs, sentences)
+    parts = _parting(episodes, sentences, pairs)
+    pairs = pairs.join(parts, on=["first", "second"], how="left", maintain_order="left") if parts.height else pairs
+    findings = [
+        _must_read(found, groups, sentences, pairs),
+        *_by_what(found),
+        _where(pairs, shared, sentences),
+        *_cannot_be_learned(words),
+        *_demonstrations(parts, episodes),
+    ]
+    looks = [(name, *_estimate(_share(right))) for name, right in found.by_look.items()]
+    schema = {"look": pl.String, **dict.fromkeys(("told", "told_low", "told_high"), pl.Float64)}
+    by_look = pl.DataFrame(looks, schema=schema, orient="row").sort("told", descending=True)
+    tables = [
+        Table("pairs", pairs, _PAIR_COLUMNS + (_PARTING if parts.height else []), "Sentence by sentence",
+              where=pl.col("verdict") != APART),
+        _word_table(words),
+        Table("looks", by_look, _LOOK_COLUMNS, "What tells the sentence, each look alone"),
+    ]  # fmt: skip
+    return findings, tables, [_matrix(pairs, sentences, episodes)]
+
+
+def _share(right: Any) -> Share:
+    return Share.of(float(np.mean(right)), len(right))
+
+
+def _estimate(share: Share) -> tuple[float, float, float]:
+    return share.value, *share.interval()
+
+
+def _pairs(episodes: DataEpisodes, sentences: _Sentences) -> pl.DataFrame:
+    """Every pair of sentences: how well first pictures tell them apart, and what is shown of it."""
+    looks, some = list(episodes.looks.values()), range(min(len(sentences.keys), MOST_SENTENCES))
+    rows = []
+    with progress_bar(len(some) * (len(some) - 1) // 2, "pairs") as advance:
+        for a, b in combinations(some, 2):
+            share = tell_apart(looks, sentences.members[a], sentences.members[b])
+            sizes = len(sentences.members[a]), len(sentences.members[b])
+            names = sentences.names[a], sentences.names[b]
+            rows.append((a, b, *names, *sizes, *_estimate(share), share.p_less(LIMIT), share.p_more(LIMIT)))
+            advance(1)
+    frame = pl.DataFrame(rows, schema=_PAIRS, orient="row")
+    return with_verdicts(frame).sort("told", "first", "second")
+
+
+def with_verdicts(frame: pl.DataFrame) -> pl.DataFrame:
+    """Rows with p_less and p_more: their q over all rows, and which of the two is shown."""
+    shown = frame.with_columns(
+        pl.Series(f"q_{side}", adjusted_p_values(frame[f"p_{side}"].to_list()), dtype=pl.Float64)
+        for side in ("less", "more")
+    )
+    less, more = (pl.col(f"q_{side}") <= NAMED_AT for side in ("less", "more"))
+    verdict = pl.when(less).then(pl.lit(SHARED)).when(more).then(pl.lit(APART)).otherwise(pl.lit(OPEN))
+    return shown.with_columns(verdict=verdict)
+
+
+def _groups(pairs: pl.DataFrame, sentences: _Sentences) -> list[list[int]]:
+    """Groups of sentences, the largest first: each shares scenes with most of the others, and is told from none."""
+    verdicts = {frozenset(row[:2]): row[2] for row in pairs.select("first", "second", "verdict").iter_rows()}
+    groups: list[list[int]] = []
+    for number in range(len(sentences.keys)):
+        found = [(group, [verdicts.get(frozenset((number, one))) for one in group]) for group in groups]
+        fitting = [group for group, of in found if 2 * of.count(SHARED) > len(of) and APART not in of]
+        if fitting:
+            max(fitting, key=len).append(number)
+        else:
+            groups.append([number])
+    return sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
+
+
+def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.DataFrame) -> Finding:
+    share, n, number = _share(found.right), len(groups), len(sentences.keys)
+    low, high = share.interval()
+    guess = float(np.bincount(groups).max() / n)
+    # The lower end: its error is that of as many answers as the share's.
+    error = float(found.gained.std()) / math.sqrt(share.effective)
+    explained = max(0.0, float(found.gained.mean()) - 1.96 * error) / found.entropy
+    beside = f"(guessing: {guess:.0%}; shuffled sentences: at most {found.shuffled.max():.0%})"
+    of = f"which of {number} sentences was given"
+    advice, limit = "", _WEAK
+    if found.p > NAMED_AT:
+        sentence = f"Perhaps: this look does not tell {of}: right in {share.value:.0%} of {n} episodes, in at most "
+        sentence += f"{high:.0%} {beside}."
+    elif low >= TELLS:
+        sentence = f"No: the first picture alone tells {of}, in at least {low:.0%} of {n} episodes {beside}; it "
+        sentence += f"explains at least {explained:.0%} of the sentences' entropy."
+        advice, limit = _advice(pairs), ""
+    else:
+        sentence = f"Only in part: the first picture alone tells {of} in {share.value:.0%} [{low:.0%}, {high:.0%}] of "
+        sentence += f"{n} episodes {beside}; it explains at least {explained:.0%} of the sentences' entropy."
+        advice = _advice(pairs)
+    numbers: dict[str, float | int | str | None] = {"told": share.value, "low": low, "high": high, "p": found.p}
+    numbers |= {"n": n, "guess": guess, "shuffled": float(found.shuffled.mean()), "explained": explained}
+    return Finding(sentence, _MUST, numbers, f"{advice} {limit}".strip())
+
+
+def _advice(pairs: pl.DataFrame) -> str:
+    """What to record: the told-apart pair whose sentences differ in the fewest words."""
+    apart = [(_difference(row["sentence"], row["other"]), row["first"], row["second"], row)
+             for row in pairs.filter(verdict=APART).iter_rows(named=True)]  # fmt: skip
+    if not apart:
+        return ""
+    row = min(apart, key=lambda one: one[:3])[3]
+    number = enough(LIMIT, 1, NAMED_AT)
+    return (
+        f"Record '{row['sentence']}' in the scenes of '{row['other']}', too: with {number} episodes of each this shows "
+        "whether the picture still tells them apart."
+    )
+
+
+def _difference(one: str, other: str) -> int:
+    first, second = (set().union(*words_by_kind(text).values()) for text in (one, other))
+    return len(first ^ second)
+
+
+def _by_what(found: Told) -> list[Finding]:
+    """Which look alone tells the sentence as well as all together do, the simplest one first."""
+    if found.p > NAMED_AT:
+        return []
+    whole = _share(found.right)
+    plain = {name: _share(right) for name, right in found.by_look.items() if name not in _ALL_OF_IT}
+    name, best = max(plain.items(), key=lambda item: item[1].value)
+    bright = {key: one for key, one in plain.items() if key.startswith("brightness")}
+    said = f"The {name} alone tells it in {best.value:.0%} {_ends(best)}"
+    numbers: dict[str, float | int | str | None] = {"look": name, "told": best.value, "whole": whole.value}
+    if not name.startswith("brightness") and bright:
+        dim, one = max(bright.items(), key=lambda item: item[1].value)
+        said += f"; the {dim} (mean and spread of its colours) in {one.value:.0%} {_ends(one)}"
+        numbers |= {"brightness": one.value}
+    limit = "Was each task recorded on a day of its own, in a light of its own?" if name.startswith("bright") else ""
+    return [Finding(f"{said}.", _BY_WHAT, numbers, limit)]
+
+
+def _ends(share: Share) -> str:
+    low, high = share.interval()
+    return f"[{low:.0%}, {high:.0%}]"
+
+
+def _where(pairs: pl.DataFrame, groups: list[list[int]], sentences: _Sentences) -> Finding:
+    counts = {verdict: pairs.filter(verdict=verdict).height for verdict in (SHARED, APART, OPEN)}
+    numbers: dict[str, float | int | str | None] = {"shared": counts[SHARED], "apart": counts[APART], "n": pairs.height}
+    needed = enough(LIMIT, pairs.height, NAMED_AT)
+    few = f"Of {plural(counts[OPEN], 'pair')} it is not known: {needed} episodes a sentence show it in 80% of cases." \
+        if counts[OPEN] else ""  # fmt: skip
+    if not groups:
+        said = f"Nowhere that this look shows: it tells {counts[APART]} of {plural(pairs.height, 'pair')} of sentences "
+        return Finding(f"{said}apart in more than {LIMIT:.0%}, none in less.", _WHERE, numbers, few)
+    inside = {frozenset(pair) for group in groups for pair in combinations(group, 2)}
+    of_groups = [row for row in pairs.iter_rows(named=True) if frozenset((row["first"], row["second"])) in inside]
+    mean = float(np.mean([row["told"] for row in of_groups]))
+    if len(groups[0]) == len(sentences.keys):
+        said = f"Everywhere: all {len(groups[0])} sentences share scenes"
+    else:
+        said = "; ".join(f"{_named(sentences.names[one] for one in group)} share scenes" for group in groups[:2])
+        said += f"; {len(groups) - 2} more groups do" if len(groups) > 2 else ""
+    shown = sum(row["verdict"] == SHARED for row in of_groups)
+    said += f": the picture tells two of them apart in {mean:.0%} (guessing: 50%; less than "
+    numbers |= {"groups": len(groups), "inside": mean}
+    return Finding(f"{said}{LIMIT:.0%} is shown of {shown} of {len(of_groups)} pairs).", _WHERE, numbers, few)
+
+
+def _named(names: Iterable[str]) -> str:
+    return listing([f"'{name}'" for name in names], _NAMES)
+
+
+def _words_by_pairs(pairs: pl.DataFrame, sentences: _Sentences) -> pl.DataFrame:
+    """Of every word that is told where another of its kind could be: whether scenes are shared, or tell it."""
+    by_kind = [words_by_kind(name) for name in sentences.names]
+    verdicts: dict[tuple[str, str], list[str]] = {}
+    for first, second, verdict in pairs.select("first", "second", "verdict").iter_rows():
+        for kind in KINDS:
+            one, other = by_kind[first][kind], by_kind[second][kind]
+            for word in (one ^ other) if one and other else ():
+                verdicts.setdefault((kind, word), []).append(verdict)
+    rows = []
+    for (kind, word), found in verdicts.items():
+        n = sum(len(sentences.members[i]) for i, words in enumerate(by_kind) if word in words[kind])
+        verdict = SHARED if SHARED in found else APART if set(found) == {APART} else OPEN
+        rows.append((kind, word, n, found.count(SHARED), len(found), verdict, None, None, None))
+    return pl.DataFrame(rows, schema=_WORD_SCHEMA, orient="row").sort("verdict", "kind", "word")
+
+
+def _words_by_picture(episodes: DataEpisodes) -> pl.DataFrame:
+    """Of every word, whether the picture tells it from other words of its kind."""
+    by_kind = [words_by_kind(sentence) for sentence in episodes.sentences]
+    looks, rows = list(episodes.looks.values()), []
+    words = [(kind, word) for kind in KINDS for word in sorted(set().union(*(one[kind] for one in by_kind)))]
+    with progress_bar(len(words), "words") as advance:
+        for kind, word in words:
+            told = np.array([word in one[kind] for one in by_kind])
+            other = np.array([bool(one[kind]) for one in by_kind]) & ~told
+            if min(told.sum(), other.sum()) >= FEWEST:
+                share = tell_apart(looks, np.flatnonzero(told), np.flatnonzero(other))
+                tests = share.p_less(LIMIT), share.p_more(LIMIT)
+                rows.append((kind, word, int(told.sum()), *_estimate(share), *tests))
+            advance(1)
+    columns = ("told", "told_low", "told_high", "p_less", "p_more")
+    schema = {"kind": pl.String, "word": pl.String, "num_episodes": pl.Int64, **dict.fromkeys(columns, pl.Float64)}
+    found = with_verdicts(pl.DataFrame(rows, schema=schema, orient="row"))
+    return found.select(
+        "kind", "word", "num_episodes", pl.lit(None, pl.Int64).alias("shared"), pl.lit(None, pl.Int64).alias("pairs"),
+        "verdict", *columns[:3],
+    ).sort("verdict", "kind", "word")  # fmt: skip
+
+
+def _asked_by_word(words: pl.DataFrame, episodes: DataEpisodes) -> Finding:
+    apart, shared, unclear = (words.filter(verdict=one)["word"].to_list() for one in (APART, SHARED, OPEN))
+    n = len(episodes.sentences)
+    begin = "Asked by word, as most sentences are told in fewer than five episodes"
+    if words.is_empty():
+        return Finding(
+            f"{begin}: no word is told in {FEWEST} of {n} episodes and another of its kind in as many.", _MUST
+        )
+    said = f"{begin}: of {words.height} words the first picture tells {len(apart)}"
+    said += f" ({_named(apart)})" if apart else ""
+    said += f", {len(shared)} share scenes with others of their kind" + (f" ({_named(shared)})" if shared else "")
+    said += f", of {len(unclear)} it is not known."
+    numbers: dict[str, float | int | str | None] = {"apart": len(apart), "shared": len(shared), "n": n}
+    return Finding(said, _MUST, numbers, _WEAK)
+
+
+def _cannot_be_learned(words: pl.DataFrame) -> list[Finding]:
+    if words.is_empty():
+        return []
+    apart, shared = (words.filter(verdict=one) for one in (APART, SHARED))
+    numbers: dict[str, float | int | str | None] = {"apart": apart.height, "shared": shared.height, "n": words.height}
+    said = []
+    if shared.height:
+        said.append(f"In the scenes of {_named(shared['word'])} another word is told in its place, too.")
+    if apart.height:
+        said.append(
+            f"Nothing makes a policy read {_named(apart['word'])}: no scene in which one is told is shared with a "
+            "sentence that has another word there."
+        )
+    return [Finding(" ".join(said) or f"Not known of any of {plural(words.height, 'word')}.", _WORDS, numbers)]
+
+
+def _parting(episodes: DataEpisodes, sentences: _Sentences, pairs: pl.DataFrame) -> pl.DataFrame:
+    """Of pairs that share scenes: from which moment on what was done tells them apart."""
+    shared = pairs.filter(verdict=SHARED).head(_MOST_PAIRS).select("first", "second").rows()
+    if episodes.motions is None or not shared:
+        return pl.DataFrame(schema=_PARTS)
+    rows = []
+    with progress_bar(len(shared), "pairs of actions") as advance:
+        moments = [looks_of_motion(episodes, moment) for moment in range(len(episodes.moments))]
+        for first, second in shared:
+            for moment, looks in zip(episodes.moments.tolist(), moments, strict=True):
+                share = tell_apart(looks, sentences.members[first], sentences.members[second])
+                tests = share.p_less(LIMIT), share.p_more(LIMIT)
+                rows.append((first, second, moment, *_estimate(share), *tests))
+            advance(1)
+    names = ("done", "done_low", "done_high", "p_less", "p_more")
+    schema = {"first": pl.Int64, "second": pl.Int64, "moment": pl.Float64, **dict.fromkeys(names, pl.Float64)}
+    each = with_verdicts(pl.DataFrame(rows, schema=schema, orient="row"))
+    last = pl.col("moment") == pl.col("moment").max()
+    return each.group_by("first", "second", maintain_order=True).agg(
+        pl.col("moment").filter(pl.col("verdict") == APART).min().alias("parts_at"),
+        *(pl.col(name).filter(last).first() for name in names[:3]),
+        (pl.col("verdict") == SHARED).all().alias("the_same"),
+    )
+
+
+def _demonstrations(parts: pl.DataFrame, episodes: DataEpisodes) -> list[Finding]:
+    if parts.is_empty():
+        return []
+    differ, same = parts.drop_nulls("parts_at"), parts.filter("the_same").height
+    n, unit, until = parts.height, episodes.unit, episodes.moments[-1]
+    numbers: dict[str, float | int | str | None] = {"differ": differ.height, "same": same, "n": n}
+    rest = (
+        f"in {same} they do not differ until {until:.2g} {unit} (told apart in less than {LIMIT:.0%})" if same else ""
+    )
+    if differ.is_empty():
+        said = f"Not shown in any of {plural(n, 'pair')} that share scenes" + (f"; {rest}" if rest else "")
+        return [Finding(f"{said}.", _ACTIONS, numbers)]
+    half = float(differ["parts_at"].quantile(0.5, "higher") or 0.0)
+    said = f"Yes, in {differ.height} of {plural(n, 'pair')} that share scenes, half of them by {half:.2g} {unit}: what "
+    said += f"was done tells the sentences apart in more than {LIMIT:.0%} (two demonstrations of one sentence: 50%)"
+    numbers |= {"parts_at": half}
+    return [Finding(f"{said}{'; ' + rest if rest else ''}.", _ACTIONS, numbers)]
+
+
+def _ways(episodes: DataEpisodes) -> pl.DataFrame:
+    """What is said, by the words with a meaning of their own; in how many ways, and how often in the commonest."""
+    counts = Counter(sentence for sentence in episodes.sentences if sentence)
+    meanings: dict[tuple[frozenset[str], ...], list[str]] = {}
+    for sentence in counts:
+        meanings.setdefault(tuple(words_by_kind(sentence).values()), []).append(sentence)
+    rows = []
+    for same in meanings.values():
+        first, n = max(same, key=counts.__getitem__), sum(counts[one] for one in same)
+        name = visible(episodes.written[first].most_common(1)[0][0])
+        rows.append((name, len(same), len(first.split()), n, counts[first] / n))
+    schema = {
+        "sentence": pl.String,
+        "ways": pl.Int64,
+        "words": pl.Int64,
+        "num_episodes": pl.Int64,
+        "commonest": pl.Float64,
+    }
+    return pl.DataFrame(rows, schema=schema, orient="row").sort("num_episodes", "sentence", descending=[True, False])
+
+
+def _said_in_ways(ways: pl.DataFrame) -> Finding:
+    sentences, several = int(ways["ways"].sum()), ways.filter(pl.col("ways") > 1)
+    vocabulary = {word for name in ways["sentence"] for word in name.lower().split()}
+    numbers: dict[str, float | int | str | None] = {"sentences": sentences, "meanings": ways.height}
+    limit = (
+        f"{plural(len(vocabulary), 'word')} in all. Counted by words with a meaning of their own: synonyms are others."
+    )
+    if several.is_empty():
+        said = f"No: {plural(ways.height, 'thing')} to do, each always said in the same words."
+    else:
+        top = several.sort("ways", descending=True).row(0, named=True)
+        said = f"Of {plural(ways.height, 'thing')} to do, {several.height} are said in more than one way; '"
+        said += f"{top['sentence']}' in {top['ways']} (this one in {top['commonest']:.0%} of its episodes)."
+    return Finding(said, _WAYS, numbers, limit)
+
+
+def _faults(episodes: DataEpisodes) -> list[Finding]:
+    """Sentences that differ in case or punctuation only, episodes under two sentences, and empty ones."""
+    otherwise = {key: kinds for key, kinds in episodes.written.items() if key and len(kinds) > 1}
+    empty = sum(not sentence for sentence in episodes.sentences)
+    parts = []
+    if otherwise:
+        kinds = max(otherwise.values(), key=lambda one: one.total())
+        names = " and ".join(f"'{visible(name)}' ({number})" for name, number in kinds.most_common(2))
+        few = len(otherwise)
+        whose = f"{plural(few, 'sentence')} {'is' if few == 1 else 'are'}"
+        parts.append(f"{whose} written in ways that differ in case or punctuation only, as {names}: counted as one")
+    if episodes.several:
+        parts.append(f"in {plural(episodes.several, 'episode')} more than one sentence is told: the first counts")
+    if empty:
+        parts.append(f"in {plural(empty, 'episode')} nothing is told: left out")
+    numbers: dict[str, float | int | str | None] = {"otherwise": len(otherwise), "several": episodes.several}
+    said = "; ".join(parts)
+    return [Finding(f"{said[0].upper()}{said[1:]}.", _FAULTS, numbers | {"empty": empty})] if parts else []
+
+
+def _matrix(pairs: pl.DataFrame, sentences: _Sentences, episodes: DataEpisodes) -> Figure:
+    """Pair by pair, those that share scenes first, with a first picture of each sentence."""
+    order = [*dict.fromkeys(number for row in pairs.select("first", "second").rows() for number in row)][:_IN_PICTURE]
+    both = pl.concat([
+        pairs.select("first", "second", "told"), pairs.select(first="second", second="first", told="told"),
+    ])  # fmt: skip
+    place = {number: i for i, number in enumerate(order)}
+    rows = [(place[a], place[b], told) for a, b, told in both.iter_rows() if a in place and b in place]
+    names = [f"{sentences.names[number]} ({i + 1})" for i, number in enumerate(order)]
+    frame = pl.DataFrame(
+        [(str(b + 1), names[a], told) for a, b, told in sorted(rows, key=lambda one: (-one[0], one[1]))],
+        schema={"other": pl.String, "sentence": pl.String, "told": pl.Float64}, orient="row",
+    )  # fmt: skip
+    beside = {names[place[number]]: episodes.pictures[sentences.keys[number]][0] for number in order}
+    options = {"x": "other", "y": "sentence", "value": "told", "share": True, "low": 0.5, "label": "told apart",
+               "xlabel": "and this one", "ylabel": "", "beside": beside}  # fmt: skip
+    left = len(sentences.keys) - len(order)
+    caption = f"{sentences.num_episodes} episodes; 50 % is guessing." + (
+        f" {left} more sentences in pairs." if left else ""
+    )
+    return Figure("pairs", "heat_map", frame, "Which sentences does the first picture tell apart?", caption, options)
+
+
+def _word_table(words: pl.DataFrame) -> Table:
+    by_picture = words["told"].is_not_null().any()
+    columns = _WORD_COLUMNS + (_TOLD if by_picture else _OF_PAIRS)
+    return Table("words", words, columns, "Word by word")
+
+
+_ALL_OF_IT = ("all of it", "all of it, curved")
+_IN_PICTURE = 24
+_PAIRS: Mapping[str, Any] = {
+    "first": pl.Int64, "second": pl.Int64, "sentence": pl.String, "other": pl.String, "num_first": pl.Int64,
+    "num_second": pl.Int64, "told": pl.Float64, "told_low": pl.Float64, "told_high": pl.Float64,
+    "p_less": pl.Float64, "p_more": pl.Float64,
+}  # fmt: skip
+_PARTS: Mapping[str, Any] = {
+    "first": pl.Int64, "second": pl.Int64, "parts_at": pl.Float64, "done": pl.Float64, "done_low": pl.Float64,
+    "done_high": pl.Float64, "the_same": pl.Boolean,
+}  # fmt: skip
+_WORD_SCHEMA: Mapping[str, Any] = {
+    "kind": pl.String, "word": pl.String, "num_episodes": pl.Int64, "shared": pl.Int64, "pairs": pl.Int64,
+    "verdict": pl.String, "told": pl.Float64, "told_low": pl.Float64, "told_high": pl.Float64,
+}  # fmt: skip
+_TOLD = [Column("told", "percent", "told by picture", "mean of both groups' shares of right answers; guessing is 50%")]
+_PAIR_COLUMNS = [
+    Column("sentence", "text"),
+    Column("other", "text"),
+    Column("num_first", "count", "episodes"),
+    Column("num_second", "count", "of the other"),
+    *_TOLD,
+    Column("verdict", "text", "", f"{SHARED}: less than {LIMIT:.0%} is shown; {APART}: more (q <= {NAMED_AT:g})"),
+]
+_PARTING = [Column("parts_at", "number", "actions part at", "s, or steps of the simulator")]
+_WORD_COLUMNS = [
+    Column("kind", "text"),
+    Column("word", "text"),
+    Column("num_episodes", "count", "episodes"),
+    Column("verdict", "text"),
+]
+_OF_PAIRS = [
+    Column("shared", "count", "pairs that share scenes"),
+    Column("pairs", "count", "of", "pairs of sentences of which one has the word, and the other another of its kind"),
+]
+_LOOK_COLUMNS = [Column("look", "text"), Column("told", "percent", "tells the sentence in", "of the episodes")]
+_WAY_COLUMNS = [
+    Column("sentence", "text"),
+    Column("ways", "count"),
+    Column("num_episodes", "count", "episodes"),
+    Column("commonest", "percent", "this one"),
+]
