@@ -13,12 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.errors import MissingDependency, UserError, plural
+from vla_attention.schemas.safe_text import plain_stderr
 
 #: `ORG/NAME`, or `ORG/NAME@REVISION` with a commit, a branch or a tag.
 HUB_NAME = re.compile(r"([A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@([A-Za-z0-9][\w./-]*))?")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _SNAPSHOTS = "snapshots"
+#: Bytes of a download from which on its size is said; files whose sizes are asked for at once.
+_WORTH_SAYING, _ASKED_AT_ONCE = 1e8, 500
 
 
 class CheckpointUnavailable(UserError, ConnectionError):
@@ -143,6 +146,31 @@ def fetch_from_hub(
             f"'{repository}'{version} could not be fetched from the Hugging Face hub ({first_line(error)}); {how}."
         ) from error
     return Path(folder)
+
+
+def say_download(
+    repository: str, files: Sequence[str], kind: Literal["model", "dataset"], revision: str | None
+) -> None:
+    """Say on stderr how many gigabytes of files are not in the cache, before `fetch_from_hub` downloads them.
+
+    Nothing is said of less than a tenth of a gigabyte, and where the hub does not tell.
+    """
+    try:
+        from huggingface_hub import HfApi, try_to_load_from_cache
+
+        absent = [
+            file
+            for file in files
+            if not isinstance(try_to_load_from_cache(repository, file, revision=revision, repo_type=kind), str)
+        ]
+        parts = [absent[first : first + _ASKED_AT_ONCE] for first in range(0, len(absent), _ASKED_AT_ONCE)]
+        found = [HfApi().get_paths_info(repository, part, revision=revision, repo_type=kind) for part in parts]
+        sizes = [getattr(file, "size", 0) for some in found for file in some]
+    except Exception:  # the download says what is wrong, in full
+        return
+    if sum(sizes) >= _WORTH_SAYING:
+        what = f"{plural(len(sizes), 'file')}, {sum(sizes) / 1e9:.2g} GB, of {repository}"
+        print(f"Downloading {what} to {hub_cache()}.", file=plain_stderr(), flush=True)
 
 
 def first_line(error: BaseException) -> str:

@@ -171,12 +171,12 @@ def with_verdicts(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _groups(pairs: pl.DataFrame, sentences: _Sentences) -> list[list[int]]:
-    """Groups of sentences, the largest first: each shares scenes with most of the others, and is told from none."""
+    """Groups of sentences, the largest first: each is shown to share scenes with another one, and is told from none."""
     verdicts = {frozenset(row[:2]): row[2] for row in pairs.select("first", "second", "verdict").iter_rows()}
     groups: list[list[int]] = []
     for number in range(len(sentences.keys)):
         found = [(group, [verdicts.get(frozenset((number, one))) for one in group]) for group in groups]
-        fitting = [group for group, of in found if 2 * of.count(SHARED) > len(of) and APART not in of]
+        fitting = [group for group, of in found if SHARED in of and APART not in of]
         if fitting:
             max(fitting, key=len).append(number)
         else:

@@ -236,11 +236,13 @@ def _looks(small: Mapping[str, Array], states: Sequence[Array]) -> dict[str, Loo
     whole = np.concatenate(blocks, axis=1)
     looks |= {EVERYTHING: Look(whole)} if len(blocks) > 1 else {}
     looks[EVERYTHING_CURVED] = Look(whole, curved=True)
-    return {name: Look(one.numbers.astype(np.float32), one.curved) for name, one in looks.items()}
+    known = {name: one for name, one in looks.items() if one.numbers.any()} or looks
+    return {name: Look(one.numbers.astype(np.float32), one.curved) for name, one in known.items()}
 
 
 def _standard(numbers: Array) -> Array:
-    return (numbers - numbers.mean(axis=0)) / (numbers.std(axis=0) + 1e-6)
+    standard: Array = (numbers - numbers.mean(axis=0)) / (numbers.std(axis=0) + 1e-6)
+    return standard
 
 
 def _scaled(numbers: Array) -> Array:

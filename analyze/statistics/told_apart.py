@@ -37,6 +37,8 @@ _TEMPERATURES = (*np.geomspace(0.02, 2.0, 13), np.inf)
 _DEPENDENCE = 1.5
 #: Columns of shuffled indicators that are multiplied at once.
 _COLUMNS = 4096
+#: Scores that differ by less are equal: products of single precision.
+_ROUNDING = 1e-5
 _NORMAL = NormalDist()
 
 
@@ -101,7 +103,7 @@ class Told:
     """How well groups are told.
 
     Attributes:
-        right: (episode,) bool, whether the episode's group was told.
+        right: (episode,) whether the episode's group was told, 1 or 0; of groups that it ties with, a part.
         by_look: the same with each look alone.
         gained: (episode,) what the look adds to the log probability of the episode's own group, in nats, over the
             groups' shares.
@@ -110,8 +112,8 @@ class Told:
         p: share of the shuffles, with the groups as they are among them, with at least as many right.
     """
 
-    right: NDArray[np.bool_]
-    by_look: Mapping[str, NDArray[np.bool_]]
+    right: NDArray[np.float32]
+    by_look: Mapping[str, NDArray[np.float32]]
     gained: Array
     entropy: float
     shuffled: Array
@@ -126,7 +128,7 @@ def tell(looks: Mapping[str, Look], groups: Labels, seed: int = 0) -> Told:
     number = int(groups.max()) + 1
     shares = np.bincount(groups, minlength=number) / len(groups)
     surprise = np.empty((len(looks), len(dealt), FOLDS))
-    right = np.empty((len(looks), *dealt.shape), dtype=bool)
+    right = np.empty((len(looks), *dealt.shape), dtype=np.float32)
     scores = np.empty((len(looks), len(groups), number), dtype=np.float32)
     at_once = max(1, _COLUMNS // number)
     for i, look in enumerate(looks.values()):
@@ -136,14 +138,16 @@ def tell(looks: Mapping[str, Look], groups: Labels, seed: int = 0) -> Told:
             y = (some.T[..., None] == np.arange(number)).astype(np.float32)  # (episode, dealt, group)
             off, surprise[i, first : first + at_once] = fitted.errors(y - shares.astype(np.float32))
             said = y - off
-            right[i, first : first + at_once] = some == said.argmax(axis=2).T
+            own = np.take_along_axis(said, some.T[..., None], axis=2)[..., 0]
+            tied = said >= said.max(axis=2, keepdims=True) - _ROUNDING
+            right[i, first : first + at_once] = ((own >= said.max(axis=2) - _ROUNDING) / tied.sum(axis=2)).T
             if first == 0:
                 scores[i] = said[:, 0]
     best = surprise.argmin(axis=0)[None][:, :, folds]  # (1, dealt, episode)
     found = np.take_along_axis(right, best, axis=0)[0]
     believed = np.take_along_axis(scores, best[0, 0][None, :, None], axis=0)[0]
     rate = found.mean(axis=1)
-    p = float((rate >= rate[0]).mean())
+    p = float((rate >= rate[0] - _ROUNDING).mean())
     by_look = dict(zip(looks, right[:, 0], strict=True))
     entropy = float(-(shares * np.log(shares)).sum())
     return Told(found[0], by_look, _gained(believed.astype(np.float64), groups, shares, folds), entropy, rate[1:], p)
@@ -169,7 +173,7 @@ def tell_apart(looks: Sequence[Look], first: Labels, second: Labels) -> Share:
         of_groups = [said[~here & (groups == group)] for group in (0, 1)]
         if all(len(one) for one in of_groups):
             beyond = said[here] - np.mean([one.mean() for one in of_groups])
-            right[here] = np.where(beyond == 0, 0.5, (beyond > 0) == (groups[here] == 1))
+            right[here] = np.where(abs(beyond) < _ROUNDING, 0.5, (beyond > 0) == (groups[here] == 1))
         else:  # all of a group look the same: nothing is known of it
             right[here] = 0.5
     value = float(np.mean([right[groups == group].mean() for group in (0, 1)]))

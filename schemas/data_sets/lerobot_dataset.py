@@ -294,7 +294,7 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
         MissingDependency, CheckpointUnavailable: the hub's client is missing, or the download failed.
     """
     # Imported here: a folder needs none of it.
-    from vla_attention.schemas.hub import downloads, fetch_from_hub, hub_version, split_hub_name
+    from vla_attention.schemas.hub import downloads, fetch_from_hub, hub_version, say_download, split_hub_name
 
     folder = Path(name).expanduser()
     on_hub = split_hub_name(str(name))
@@ -316,10 +316,14 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
     # The files of episodes are of the same commit as the meta files, whatever is uploaded meanwhile.
     commit = revision if version is None else version.commit
 
+    fetched: set[str] = set()
+
     def fetch(paths: Sequence[str]) -> None:
-        if paths:
+        if missing := [path for path in paths if path not in fetched]:
+            say_download(repository, missing, "dataset", commit)
             # Paths come from the data set: a star in one would fetch every file of the repository.
-            fetch_from_hub(repository, [*map(glob.escape, paths)], how, kind="dataset", revision=commit)
+            fetch_from_hub(repository, [*map(glob.escape, missing)], how, kind="dataset", revision=commit)
+            fetched.update(missing)
 
     return LeRobotDataset(folder, repository, fetch, downloads(folder))
 
