@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.core.data_episodes import DataEpisodes, looks_of_motion
+from vla_attention.analyze.core.data_episodes import EVERYTHING, DataEpisodes, looks_of_motion
 from vla_attention.analyze.core.exchanged import KINDS, words_by_kind
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.statistics.many_looks import NAMED_AT, adjusted_p_values
-from vla_attention.analyze.statistics.told_apart import Labels, Share, Told, enough, tell, tell_apart
+from vla_attention.analyze.statistics.told_apart import SHUFFLES, Labels, Share, Told, enough, tell, tell_apart
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import visible
@@ -184,6 +184,11 @@ def _groups(pairs: pl.DataFrame, sentences: _Sentences) -> list[list[int]]:
     return sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
 
 
+def _is_told(found: Told) -> bool:
+    """Whether the sentence is told more often than in any of the ways to shuffle them: of null data, in 1 %."""
+    return found.p * (SHUFFLES + 1) < 1.5
+
+
 def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.DataFrame) -> Finding:
     share, n, number = _share(found.right), len(groups), len(sentences.keys)
     low, high = share.interval()
@@ -194,7 +199,7 @@ def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.Dat
     beside = f"(guessing: {guess:.0%}; shuffled sentences: at most {found.shuffled.max():.0%})"
     of = f"which of {number} sentences was given"
     advice, limit = "", _WEAK
-    if found.p > NAMED_AT:
+    if not _is_told(found):
         sentence = f"Perhaps: this look does not tell {of}: right in {share.value:.0%} of {n} episodes, in at most "
         sentence += f"{high:.0%} {beside}."
     elif low >= TELLS:
@@ -230,19 +235,20 @@ def _difference(one: str, other: str) -> int:
 
 
 def _by_what(found: Told) -> list[Finding]:
-    """Which look alone tells the sentence as well as all together do, the simplest one first."""
-    if found.p > NAMED_AT:
+    """The simplest look that tells the sentence nearly as well as the best one: brightness, state, picture."""
+    if not _is_told(found):
         return []
-    whole = _share(found.right)
-    plain = {name: _share(right) for name, right in found.by_look.items() if name not in _ALL_OF_IT}
-    name, best = max(plain.items(), key=lambda item: item[1].value)
-    bright = {key: one for key, one in plain.items() if key.startswith("brightness")}
-    said = f"The {name} alone tells it in {best.value:.0%} {_ends(best)}"
-    numbers: dict[str, float | int | str | None] = {"look": name, "told": best.value, "whole": whole.value}
-    if not name.startswith("brightness") and bright:
-        dim, one = max(bright.items(), key=lambda item: item[1].value)
-        said += f"; the {dim} (mean and spread of its colours) in {one.value:.0%} {_ends(one)}"
-        numbers |= {"brightness": one.value}
+    alone = [(name, _share(right)) for name, right in found.by_look.items() if not name.startswith(EVERYTHING)]
+    best_name, best = max(alone, key=lambda one: one[1].value)
+    simple = sorted(alone, key=lambda one: (one[0].startswith("picture"), -one[1].value))
+    name, share = next(one for one in simple if one[1].value >= best.interval()[0])
+    said = f"The {name} alone tells it in {share.value:.0%} {_ends(share)}"
+    numbers: dict[str, float | int | str | None] = {"look": name, "told": share.value, "best": best_name}
+    bright = [one for one in simple if one[0].startswith("brightness")]
+    if name.startswith("picture") and bright:
+        said += (
+            f"; the {bright[0][0]} (mean and spread of its colours) in {bright[0][1].value:.0%} {_ends(bright[0][1])}"
+        )
     limit = "Was each task recorded on a day of its own, in a light of its own?" if name.startswith("bright") else ""
     return [Finding(f"{said}.", _BY_WHAT, numbers, limit)]
 
@@ -481,7 +487,6 @@ def _word_table(words: pl.DataFrame) -> Table:
     return Table("words", words, columns, "Word by word")
 
 
-_ALL_OF_IT = ("all of it", "all of it, curved")
 _IN_PICTURE = 24
 _PAIRS: Mapping[str, Any] = {
     "first": pl.Int64, "second": pl.Int64, "sentence": pl.String, "other": pl.String, "num_first": pl.Int64,

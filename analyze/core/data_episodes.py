@@ -71,8 +71,12 @@ class DataEpisodes:
 
 
 @dataclass(frozen=True)
-class _Episode:
-    """One episode: its pictures by camera, its state (time, number) or None, its actions (time, number) or None."""
+class Episode:
+    """What is read of one episode.
+
+    instruction: as it is written. several: whether another one is told later. images: camera -> the first picture.
+    state: the first one, (number,). actions, states: (time, number), if they are known. times: (time,).
+    """
 
     instruction: str
     several: bool
@@ -99,13 +103,13 @@ def read_episodes(place: str | Path, num_episodes: int | None = None) -> DataEpi
         store = open_store(store_place(str(place)))
         chosen = _spread(store.episodes, most)
         moments = _moments([one.attributes.num_steps for one in chosen])
-        return _collected(store.suite, len(store.episodes), len(chosen), _of_store(store, chosen), moments, "steps")
+        return collected(store.suite, len(store.episodes), len(chosen), _of_store(store, chosen), moments, "steps")
     data = open_dataset(place)
     numbers = _spread(data.episode_numbers, most)
     data.check_files(numbers, data.cameras)
     moments = _moments([data.entry(number).length for number in numbers]) / data.fps
     episodes = _of_data_set(data, numbers)
-    return _collected(data.name, len(data.episode_numbers), len(numbers), episodes, moments, "s")
+    return collected(data.name, len(data.episode_numbers), len(numbers), episodes, moments, "s")
 
 
 def _moments(lengths: Sequence[int]) -> Array:
@@ -123,7 +127,7 @@ def _spread(all_of_them: Sequence, most: int) -> list:  # type: ignore[type-arg]
     return [all_of_them[place] for place in places]
 
 
-def _of_data_set(data: LeRobotDataset, numbers: Sequence[int]) -> Iterator[_Episode]:
+def _of_data_set(data: LeRobotDataset, numbers: Sequence[int]) -> Iterator[Episode]:
     numeric = [name for name, feature in data.features.items() if feature.dtype.startswith(("float", "int", "uint"))]
     states = [name for name in numeric if "state" in name and len(data.feature(name).shape) <= 1]
     actions = [name for name in numeric if name.split(".")[0] == "action" and len(data.feature(name).shape) <= 1]
@@ -133,10 +137,10 @@ def _of_data_set(data: LeRobotDataset, numbers: Sequence[int]) -> Iterator[_Epis
         state = np.concatenate([np.zeros((episode.length, 0)), *(episode.column(name) for name in states)], axis=1)
         action = np.concatenate([episode.column(name) for name in actions], axis=1) if actions else None
         several = len(np.unique(episode.task_indices)) > 1
-        yield _Episode(first.instruction, several, first.images, state[0], action, episode.seconds, state)
+        yield Episode(first.instruction, several, first.images, state[0], action, episode.seconds, state)
 
 
-def _of_store(store: Store, chosen: Sequence[StoredEpisode]) -> Iterator[_Episode]:
+def _of_store(store: Store, chosen: Sequence[StoredEpisode]) -> Iterator[Episode]:
     for episode in chosen:
         attributes = episode.attributes
         images = {
@@ -147,13 +151,23 @@ def _of_store(store: Store, chosen: Sequence[StoredEpisode]) -> Iterator[_Episod
         state = episode.read("state", 0) if episode.has("state") else np.zeros(0)
         actions = episode.read(EXECUTED) if episode.has(EXECUTED) else None
         times = np.arange(0 if actions is None else len(actions), dtype=np.float64)
-        yield _Episode(told_instruction(store, attributes), False, images, state, actions, times, None)
+        yield Episode(told_instruction(store, attributes), False, images, state, actions, times, None)
         episode.forget()
 
 
-def _collected(
-    name: str, total: int, number: int, episodes: Iterator[_Episode], moments: Array, unit: str
+def collected(
+    name: str, total: int, number: int, episodes: Iterator[Episode], moments: Array, unit: str
 ) -> DataEpisodes:
+    """What is kept of episodes that are read one after the other.
+
+    Args:
+        name: of the data set or store.
+        total: how many episodes it has.
+        number: how many are read.
+        episodes: those.
+        moments: (moment,) at which actions are looked at.
+        unit: of the moments.
+    """
     sentences: list[str] = []
     written: dict[str, Counter[str]] = {}
     small: dict[str, list[Array]] = {}
@@ -251,7 +265,7 @@ def _scaled(numbers: Array) -> Array:
     return norm
 
 
-def _motion(episode: _Episode, moments: Array) -> Array | None:
+def _motion(episode: Episode, moments: Array) -> Array | None:
     """(moment, number): the mean action since the beginning, that since the moment before, and the state then."""
     parts = []
     ends = np.clip(np.searchsorted(episode.times, moments), 1, None)

@@ -38,7 +38,7 @@ _DEPENDENCE = 1.5
 #: Columns of shuffled indicators that are multiplied at once.
 _COLUMNS = 4096
 #: Scores that differ by less are equal: products of single precision.
-_ROUNDING = 1e-5
+_ROUNDING = 1e-4
 _NORMAL = NormalDist()
 
 
@@ -251,11 +251,11 @@ class _Fitted:
         this kernel, at its best scale. By the chain rule it follows from the whole's and the fold's own.
         """
         y = y.astype(np.float32)
-        flat = (self.inverse @ y.reshape(len(y), -1)).reshape(y.shape)
+        flat = np.tensordot(self.inverse, y, 1)
         off, total = np.empty_like(flat), np.einsum("idk,idk->d", y, flat)
         surprise = np.empty((y.shape[1], FOLDS))
         for fold, (here, own) in enumerate(self.of_folds):
-            off[here] = (own @ flat[here].reshape(len(here), -1)).reshape(len(here), *y.shape[1:])
+            off[here] = np.tensordot(own, flat[here], 1)
             rest = np.maximum(total - np.einsum("idk,idk->d", off[here], flat[here]), 1e-9)
             surprise[:, fold] = (len(y) - len(here)) * np.log(rest) - self.volume[fold]
         return off, surprise
