@@ -10,6 +10,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.estimate import estimate
+from vla_attention.analyze.core.listening import ASK_THE_DATA
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.render.answer import Answer
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
@@ -162,7 +163,8 @@ def _findings(found: pl.DataFrame, each: pl.DataFrame) -> list[Finding]:
         change = f"told '{top['kind']}' the action changes by {top['change']:.2g} of its spread"
         sentence = f"Not shown to hear: {change}, and told the same again by {noise:.2g}."
         numbers = {"change": top["change"], "times": top["times"], "again": noise, "hears": 0}
-        return [Finding(sentence, _LISTENS, numbers, f"{_could_show(top['times_detectable'])}{_QUEUE}")]
+        limit = f"{_could_show(top['times_detectable'])}{_QUEUE}"
+        return [Finding(sentence, _LISTENS, numbers, limit, ASK_THE_DATA)]
     top = shown.row(0, named=True)
     sentence = f"It hears: told '{top['kind']}' the action changes by {top['change']:.2g} of its spread"
     if quiet:

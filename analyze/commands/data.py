@@ -155,8 +155,20 @@ def _pairs(episodes: DataEpisodes, sentences: _Sentences) -> pl.DataFrame:
             names = sentences.names[a], sentences.names[b]
             rows.append((a, b, *names, *sizes, *_estimate(share), share.p_less(LIMIT), share.p_more(LIMIT)))
             advance(1)
-    frame = pl.DataFrame(rows, schema=_PAIRS, orient="row")
-    return with_verdicts(frame).sort("told", "first", "second")
+    frame = with_verdicts(pl.DataFrame(rows, schema=_PAIRS, orient="row")).sort("told", "first", "second")
+    differ = [_where_they_differ(one, other) for one, other in frame.select("sentence", "other").rows()]
+    return frame.with_columns(differ=pl.Series(differ, dtype=pl.String))
+
+
+def _where_they_differ(one: str, other: str) -> str:
+    """Two sentences without the words with which both begin and end."""
+    first, second = one.split(), other.split()
+    fewest = min(len(first), len(second)) - 1
+    begin = next((i for i in range(fewest) if first[i] != second[i]), fewest)
+    left = fewest - begin
+    end = next((i for i in range(left) if first[-1 - i] != second[-1 - i]), left)
+    parts = [" ".join(words[begin : len(words) - end]) for words in (first, second)]
+    return f"{'… ' if begin else ''}{parts[0]} / {parts[1]}{' …' if end else ''}"
 
 
 def with_verdicts(frame: pl.DataFrame) -> pl.DataFrame:
@@ -278,7 +290,7 @@ def _where(pairs: pl.DataFrame, groups: list[list[int]], sentences: _Sentences) 
     shown = sum(row["verdict"] == SHARED for row in of_groups)
     said += f": the picture tells two of them apart in {mean:.0%} (guessing: 50%; less than "
     numbers |= {"groups": len(groups), "inside": mean}
-    return Finding(f"{said}{LIMIT:.0%} is shown of {shown} of {len(of_groups)} pairs).", _WHERE, numbers, few)
+    return Finding(f"{said}{LIMIT:.0%} is shown of {shown} of {plural(len(of_groups), 'pair')}).", _WHERE, numbers, few)
 
 
 def _named(names: Iterable[str]) -> str:
@@ -503,10 +515,7 @@ _WORD_SCHEMA: Mapping[str, Any] = {
 }  # fmt: skip
 _TOLD = [Column("told", "percent", "told by picture", "mean of both groups' shares of right answers; guessing is 50%")]
 _PAIR_COLUMNS = [
-    Column("sentence", "text"),
-    Column("other", "text"),
-    Column("num_first", "count", "episodes"),
-    Column("num_second", "count", "of the other"),
+    Column("differ", "text", "sentences"),
     *_TOLD,
     Column("verdict", "text", "", f"{SHARED}: less than {LIMIT:.0%} is shown; {APART}: more (q <= {NAMED_AT:g})"),
 ]

@@ -17,7 +17,7 @@ from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.exchanged import exchanged
-from vla_attention.analyze.core.listening import LISTENS, listens, table_of_parts
+from vla_attention.analyze.core.listening import ASK_THE_DATA, IN_PART, LISTENS, NOT_SHOWN, listens, table_of_parts
 from vla_attention.analyze.core.naming import ObjectAttention, named_in
 from vla_attention.analyze.core.perturbations import any_perturbed, by_suite, perturbations
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
@@ -42,7 +42,8 @@ def language(question: Question) -> Result:
         behaved = Finding(said, LISTENS)
     if not asked.is_empty():
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
-        behaved = replace(behaved, next_step=failures)
+        is_deaf = behaved.numbers.get("verdict") in (NOT_SHOWN, IN_PART)
+        behaved = replace(behaved, next_step=ASK_THE_DATA if is_deaf else failures)
     done = _behaviour_tables(asked)
     followed, matrix, pictured = exchanged(asked, question.sampling)
     by_change, changes = _perturbed(question, asked)

@@ -268,6 +268,8 @@ def _scaled(numbers: Array) -> Array:
 def _motion(episode: Episode, moments: Array) -> Array | None:
     """(moment, number): the mean action since the beginning, that since the moment before, and the state then."""
     parts = []
+    if len(episode.times) < 2:
+        return None
     ends = np.clip(np.searchsorted(episode.times, moments), 1, None)
     if episode.actions is not None and len(episode.actions):
         ends = np.minimum(ends, len(episode.actions))

@@ -21,6 +21,8 @@ from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.words import folded_words
 
 LISTENS = "Does it listen?"
+#: Where a policy does not: nothing may have made it read.
+ASK_THE_DATA = "vla-attention data TRAINING_DATA   # could the first picture tell it the sentence?"
 #: From this share of episodes on, what was done most is said.
 _MOSTLY = 0.8
 #: Of the words that are heard, or not, so many are named.

@@ -12,6 +12,8 @@ from vla_attention.analyze.render.numbers import cell
 WIDTH, LINES = 100, 40
 #: A table of which fewer rows would fit is left out.
 _FEWEST_ROWS = 3
+#: To so many characters the texts of a column are cut where a table is too wide.
+_SHORTEST_TEXT = 24
 #: Lines that name the tables that did not fit.
 _NAMES_LEFT = 2
 _NO_END = 1_000_000
@@ -88,6 +90,10 @@ def _fitting(table: Table, rows: int) -> tuple[list[Column], list[list[str]], li
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
     if columns[-1].kind == "prose":
         widths[-1] = max(20, WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1))
+    # The longest texts are cut first; then the last columns give way.
+    texts = [i for i, column in enumerate(columns) if column.kind == "text"]
+    while texts and sum(widths) + 2 * (len(widths) - 1) > WIDTH and max(widths[i] for i in texts) > _SHORTEST_TEXT:
+        widths[max(texts, key=lambda i: widths[i])] -= 1
     while len(widths) > 2 and sum(widths) + 2 * (len(widths) - 1) > WIDTH and columns[-1].kind not in ("text", "prose"):
         columns, widths = columns[:-1], widths[:-1]
     return columns, cells, widths
@@ -112,5 +118,6 @@ def _laid_out(table: Table, rows: int) -> list[str]:
 
 
 def shortened(name: str, width: int) -> str:
-    """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
-    return name if len(name) <= width else f"{name[: width - 1]}…"
+    """A name that must not be broken at spaces, in at most so many characters, with … where its middle was cut."""
+    end = (width - 1) // 2
+    return name if len(name) <= width else f"{name[: width - 1 - end]}…{name[len(name) - end :]}"

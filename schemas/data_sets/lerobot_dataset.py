@@ -210,7 +210,8 @@ class DataSetEpisode:
         feature = self.dataset.feature(name)
         if feature.is_picture:
             raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds {feature.dtype}, not numbers.")
-        values, stated = self._numbers([name])[name], math.prod(feature.shape)
+        known = self._numbers if name in self._numbers else self._read([name])
+        values, stated = known[name], math.prod(feature.shape)
         if isinstance(values, str):
             raise BadArgument(f"The column '{name}' of {self._what} holds {values}, not as many numbers in each frame.")
         if values.shape[1] != stated:
@@ -225,7 +226,12 @@ class DataSetEpisode:
             )
         return values
 
-    def _numbers(self, columns: Sequence[str]) -> dict[str, NDArray[np.float64] | str]:
+    @cached_property
+    def _numbers(self) -> dict[str, NDArray[np.float64] | str]:
+        """All columns of numbers that the table has, read at once: each reading asks another process."""
+        return self._read([n for n, it in self.dataset.features.items() if not it.is_picture and n in self._columns])
+
+    def _read(self, columns: Sequence[str]) -> dict[str, NDArray[np.float64] | str]:
         return self.dataset.process.call(self._table, read_numbers, self._table, columns, self._rows)
 
     def frames(self, every: int = 1, cameras: Sequence[str] | None = None) -> Iterator[DataSetFrame]:
@@ -244,9 +250,8 @@ class DataSetEpisode:
         for name in names:
             if not self.dataset.feature(name).is_camera:
                 raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds no colour pictures.")
-        of_numbers = [name for name, it in self.dataset.features.items() if not it.is_picture and name in self._columns]
         # Texts and lists of several lengths are nothing that a policy reads as numbers.
-        numbers = {name: it for name, it in self._numbers(of_numbers).items() if not isinstance(it, str)}
+        numbers = {name: it for name, it in self._numbers.items() if not isinstance(it, str)}
         self.dataset.fetch([self.entry.videos[name].path for name in names if name in self.entry.videos])
         self._check_ends(names)
         for frame in range(0, self.length, every):
