@@ -75,18 +75,18 @@ def data(episodes: DataEpisodes) -> Result:
         )
     sentences = _Sentences.of(episodes)
     figures: list[Figure] = []
+    notes: list[str] = []
     by_word = len(sentences.keys) < 2 or 2 * sentences.num_episodes < len(told)
     if by_word:
         words = _words_by_picture(episodes)
         findings, tables = [_asked_by_word(words, episodes)], [_word_table(words)]
     else:
-        findings, tables, figures = _by_sentence(episodes, sentences)
+        findings, tables, figures, notes = _by_sentence(episodes, sentences)
     ways = _ways(episodes)
     left = len(told) - sentences.num_episodes
-    notes = [
-        f"{plural(left, 'episode')} of {plural(len(set(told)) - len(sentences.keys), 'sentence')} left out: told in "
-        f"fewer than {FEWEST} episodes."
-    ] if left and not by_word else []  # fmt: skip
+    if left and not by_word:
+        few = plural(len(set(told)) - len(sentences.keys), "sentence")
+        notes.append(f"{plural(left, 'episode')} of {few} left out: told in fewer than {FEWEST} episodes.")
     return Result(
         "Do the data ask for the sentence?",
         _about(episodes, len(set(told))),
@@ -107,7 +107,9 @@ def _about(episodes: DataEpisodes, number: int) -> list[str]:
     ]
 
 
-def _by_sentence(episodes: DataEpisodes, sentences: _Sentences) -> tuple[list[Finding], list[Table], list[Figure]]:
+def _by_sentence(
+    episodes: DataEpisodes, sentences: _Sentences
+) -> tuple[list[Finding], list[Table], list[Figure], list[str]]:
     chosen = np.concatenate(sentences.members)
     order = np.argsort(chosen)
     groups = np.repeat(np.arange(len(sentences.keys)), [len(one) for one in sentences.members])[order]
@@ -117,6 +119,11 @@ def _by_sentence(episodes: DataEpisodes, sentences: _Sentences) -> tuple[list[Fi
     words = _words_by_pairs(pairs, sentences)
     parts = _parting(episodes, sentences, pairs)
     pairs = pairs.join(parts, on=["first", "second"], how="left", maintain_order="left") if parts.height else pairs
+    notes = (
+        [f"{len(groups)} episodes begin in {found.scenes} ways that look different: what looks the same counts once."]
+        if found.scenes < len(groups)
+        else []
+    )
     findings = [
         _must_read(found, groups, sentences, pairs),
         *_by_what(found),
@@ -124,7 +131,7 @@ def _by_sentence(episodes: DataEpisodes, sentences: _Sentences) -> tuple[list[Fi
         *_cannot_be_learned(words),
         *_demonstrations(parts, episodes),
     ]
-    looks = [(name, *_estimate(_share(right))) for name, right in found.by_look.items()]
+    looks = [(name, *_estimate(_share(right, found.scenes))) for name, right in found.by_look.items()]
     schema = {"look": pl.String, **dict.fromkeys(("told", "told_low", "told_high"), pl.Float64)}
     by_look = pl.DataFrame(looks, schema=schema, orient="row").sort("told", descending=True)
     tables = [
@@ -133,11 +140,11 @@ def _by_sentence(episodes: DataEpisodes, sentences: _Sentences) -> tuple[list[Fi
         _word_table(words),
         Table("looks", by_look, _LOOK_COLUMNS, "What tells the sentence, each look alone"),
     ]  # fmt: skip
-    return findings, tables, [_matrix(pairs, sentences, episodes)]
+    return findings, tables, [_matrix(pairs, sentences, episodes)], notes
 
 
-def _share(right: Any) -> Share:
-    return Share.of(float(np.mean(right)), len(right))
+def _share(right: Any, scenes: int) -> Share:
+    return Share.of(float(np.mean(right)), scenes)
 
 
 def _estimate(share: Share) -> tuple[float, float, float]:
@@ -202,12 +209,13 @@ def _is_told(found: Told) -> bool:
 
 
 def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.DataFrame) -> Finding:
-    share, n, number = _share(found.right), len(groups), len(sentences.keys)
+    share, n, number = _share(found.right, found.scenes), len(groups), len(sentences.keys)
     low, high = share.interval()
     guess = float(np.bincount(groups).max() / n)
     # The lower end: its error is that of as many answers as the share's.
     error = float(found.gained.std()) / math.sqrt(share.effective)
     explained = max(0.0, float(found.gained.mean()) - 1.96 * error) / found.entropy
+    explains = f"more than {_ALL:.0%}" if explained > _ALL else f"at least {explained:.0%}"
     beside = f"(guessing: {guess:.0%}; shuffled sentences: at most {found.shuffled.max():.0%})"
     of = f"which of {number} sentences was given"
     advice, limit = "", _WEAK
@@ -216,11 +224,11 @@ def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.Dat
         sentence += f"{high:.0%} {beside}."
     elif low >= TELLS:
         sentence = f"No: the first picture alone tells {of}, in at least {low:.0%} of {n} episodes {beside}; it "
-        sentence += f"explains at least {explained:.0%} of the sentences' entropy."
+        sentence += f"explains {explains} of the sentences' entropy."
         advice, limit = _advice(pairs), ""
     else:
         sentence = f"Only in part: the first picture alone tells {of} in {share.value:.0%} [{low:.0%}, {high:.0%}] of "
-        sentence += f"{n} episodes {beside}; it explains at least {explained:.0%} of the sentences' entropy."
+        sentence += f"{n} episodes {beside}; it explains {explains} of the sentences' entropy."
         advice = _advice(pairs)
     numbers: dict[str, float | int | str | None] = {"told": share.value, "low": low, "high": high, "p": found.p}
     numbers |= {"n": n, "guess": guess, "shuffled": float(found.shuffled.mean()), "explained": explained}
@@ -250,7 +258,9 @@ def _by_what(found: Told) -> list[Finding]:
     """The simplest look that tells the sentence nearly as well as the best one: brightness, state, picture."""
     if not _is_told(found):
         return []
-    alone = [(name, _share(right)) for name, right in found.by_look.items() if not name.startswith(EVERYTHING)]
+    alone = [
+        (name, _share(right, found.scenes)) for name, right in found.by_look.items() if not name.startswith(EVERYTHING)
+    ]
     best_name, best = max(alone, key=lambda one: one[1].value)
     simple = sorted(alone, key=lambda one: (one[0].startswith("picture"), -one[1].value))
     name, share = next(one for one in simple if one[1].value >= best.interval()[0])
@@ -499,7 +509,8 @@ def _word_table(words: pl.DataFrame) -> Table:
     return Table("words", words, columns, "Word by word")
 
 
-_IN_PICTURE = 24
+#: Sentences in the picture; the largest part of the entropy that is said as a number.
+_IN_PICTURE, _ALL = 24, 0.99
 _PAIRS: Mapping[str, Any] = {
     "first": pl.Int64, "second": pl.Int64, "sentence": pl.String, "other": pl.String, "num_first": pl.Int64,
     "num_second": pl.Int64, "told": pl.Float64, "told_low": pl.Float64, "told_high": pl.Float64,

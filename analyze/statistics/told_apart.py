@@ -103,6 +103,7 @@ class Told:
     """How well groups are told.
 
     Attributes:
+        scenes: how many episodes look different.
         right: (episode,) whether the episode's group was told, 1 or 0; of groups that it ties with, a part.
         by_look: the same with each look alone.
         gained: (episode,) what the look adds to the log probability of the episode's own group, in nats, over the
@@ -112,6 +113,7 @@ class Told:
         p: share of the shuffles, with the groups as they are among them, with at least as many right.
     """
 
+    scenes: int
     right: NDArray[np.float32]
     by_look: Mapping[str, NDArray[np.float32]]
     gained: Array
@@ -123,7 +125,8 @@ class Told:
 def tell(looks: Mapping[str, Look], groups: Labels, seed: int = 0) -> Told:
     """How well the groups (episode,), numbers from 0, are told from the looks."""
     rng = np.random.default_rng(seed)
-    folds = _folds(groups, _same(looks.values()))
+    same = _same(looks.values())
+    folds = _folds(groups, same)
     dealt = np.stack([groups, *(_shuffled(groups, folds, rng) for _ in range(SHUFFLES))])
     number = int(groups.max()) + 1
     shares = np.bincount(groups, minlength=number) / len(groups)
@@ -150,19 +153,23 @@ def tell(looks: Mapping[str, Look], groups: Labels, seed: int = 0) -> Told:
     p = float((rate >= rate[0] - _ROUNDING).mean())
     by_look = dict(zip(looks, right[:, 0], strict=True))
     entropy = float(-(shares * np.log(shares)).sum())
-    return Told(found[0], by_look, _gained(believed.astype(np.float64), groups, shares, folds), entropy, rate[1:], p)
+    scenes = len(np.unique(same))
+    return Told(
+        scenes, found[0], by_look, _gained(believed.astype(np.float64), groups, shares, folds), entropy, rate[1:], p
+    )
 
 
 def tell_apart(looks: Sequence[Look], first: Labels, second: Labels) -> Share:
     """How well two groups of episodes, by their numbers, are told apart.
 
     It is the mean of both groups' shares of right answers, so that 0.5 is guessing. Its error is that of
-    4 / (1 / n + 1 / m) answers where the groups have n and m episodes.
+    4 / (1 / n + 1 / m) answers where the groups have n and m episodes that look different.
     """
     chosen = np.concatenate([first, second])
     groups = np.repeat([0, 1], [len(first), len(second)])
     own = [look.of(chosen) for look in looks]
-    folds = _folds(groups, _same(own))
+    same = _same(own)
+    folds = _folds(groups, same)
     y = np.where(groups == 0, -1.0, 1.0)
     fits = [_Fitted.of(look, folds).errors((y - y.mean())[:, None, None]) for look in own]
     best = np.stack([surprise[0] for _, surprise in fits]).argmin(axis=0)  # (fold,)
@@ -177,7 +184,8 @@ def tell_apart(looks: Sequence[Look], first: Labels, second: Labels) -> Share:
         else:  # all of a group look the same: nothing is known of it
             right[here] = 0.5
     value = float(np.mean([right[groups == group].mean() for group in (0, 1)]))
-    return Share.of(value, 4 / (1 / len(first) + 1 / len(second)))
+    number, other = (len(np.unique(same[groups == group])) for group in (0, 1))
+    return Share.of(value, 4 / (1 / number + 1 / other))
 
 
 def enough(limit: float, tests: int, level: float, power: float = 0.8) -> int:
