@@ -241,6 +241,7 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
 
     use_examples(laptop, folder)
     capture_and_analyse(laptop, node, folder)
+    ask_a_data_set(laptop, folder)
 
 
 def capture_and_analyse(laptop: Path, node: Path, folder: Path) -> None:
@@ -262,6 +263,20 @@ def capture_and_analyse(laptop: Path, node: Path, folder: Path) -> None:
     check(len(results) == 1, f"expected one results file in {output}, found {results}")
     run(laptop / "parse-attention-ratio-results", "--results", results[0], cwd=folder, quiet=True)
     print("captured a store and analysed it with the installed wheel")
+
+
+def ask_a_data_set(laptop: Path, folder: Path) -> None:
+    """With the extra `datasets` and without torch, ask a data set with videos what its first pictures tell."""
+    sys.path.insert(0, str(ROOT))
+    from tests.kit.lerobot_data_sets import H264, made_up_episodes, write_data_set
+
+    shutil.rmtree(folder / "data_set", ignore_errors=True)
+    write_data_set(folder / "data_set", "v3.0", made_up_episodes((3,) * 12), video=H264)
+    (av,) = project()["optional-dependencies"]["datasets"]
+    run(sys.executable, "-m", "pip", "--quiet", "--python", laptop / "python", "install", av, quiet=True)
+    command = (laptop / "vla-attention", "data", "data_set", "--output", "of_data_set")
+    answer = run(*command, cwd=folder, quiet=True)
+    check("Must a policy read the sentence here?" in answer, f"asked of a data set, it says: {answer}")
 
 
 def interpreters() -> list[str]:
