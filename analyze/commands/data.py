@@ -8,57 +8,45 @@ differ where the pictures do not; and in how many ways the same is said.
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from itertools import combinations
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.core.data_episodes import EVERYTHING, DataEpisodes, looks_of_motion
-from vla_attention.analyze.core.exchanged import KINDS, words_by_kind
+from vla_attention.analyze.core.data_episodes import EVERYTHING, DataEpisodes
+from vla_attention.analyze.core.exchanged import words_by_kind
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.statistics.many_looks import NAMED_AT, adjusted_p_values
-from vla_attention.analyze.statistics.told_apart import SHUFFLES, Labels, Share, Told, enough, tell, tell_apart
+from vla_attention.analyze.core.shared_scenes import (
+    APART,
+    FEWEST,
+    LIMIT,
+    MOST_SENTENCES,
+    OPEN,
+    SHARED,
+    Sentences,
+    estimate_of,
+    groups_of,
+    pairs_of,
+    parting,
+    ways_of,
+    words_by_pairs,
+    words_by_picture,
+)
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.told_apart import SHUFFLES, Labels, Share, Told, enough, tell
 from vla_attention.schemas.errors import BadArgument, listing, plural
-from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import visible
 
-#: Sentences of fewer episodes are left out; of more sentences than this, those of most episodes are compared in pairs.
-FEWEST, MOST_SENTENCES = 5, 150
-#: Told apart in less than this share of episodes, scenes count as shared: half of the way from guessing to knowing.
-LIMIT = 0.75
+Numbers: TypeAlias = dict[str, float | int | str | None]
 #: From this share on, the picture tells the sentence.
 TELLS = 0.9
-SHARED, APART, OPEN = "share scenes", "told apart", "not known"
-#: Pairs whose actions are compared, and names in a sentence.
-_MOST_PAIRS, _NAMES = 60, 4
+#: Names in a sentence.
+_NAMES = 4
 _MUST, _WHERE, _WORDS, _BY_WHAT = "Must a policy read the sentence here?", "Where must it?", "Which words?", "By what?"
 _ACTIONS, _WAYS, _FAULTS = "Do the demonstrations differ there?", "Is it said in more than one way?", "Faults?"
 _WEAK = "A network may see more than this look: small pictures (8 x 8 colours and edges) and the first state."
-
-
-@dataclass(frozen=True)
-class _Sentences:
-    """The sentences that are compared, those of most episodes first: names as written, and episodes (sentence,)."""
-
-    names: tuple[str, ...]
-    keys: tuple[str, ...]
-    members: tuple[Labels, ...]
-
-    @classmethod
-    def of(cls, data: DataEpisodes) -> _Sentences:
-        counts = Counter(sentence for sentence in data.sentences if sentence)
-        keys = tuple(key for key, number in counts.most_common() if number >= FEWEST)
-        told = np.array(data.sentences, dtype=object)
-        names = tuple(visible(data.written[key].most_common(1)[0][0]) for key in keys)
-        return cls(names, keys, tuple(np.flatnonzero(told == key) for key in keys))
-
-    @property
-    def num_episodes(self) -> int:
-        return sum(map(len, self.members))
 
 
 def data(episodes: DataEpisodes) -> Result:
@@ -73,16 +61,16 @@ def data(episodes: DataEpisodes) -> Result:
             f"'{episodes.name}' tells {plural(len(set(told)), 'sentence')} in {plural(len(told), 'episode')}; expected "
             "two or more: with one there is nothing to tell apart."
         )
-    sentences = _Sentences.of(episodes)
+    sentences = Sentences.of(episodes)
     figures: list[Figure] = []
     notes: list[str] = []
     by_word = len(sentences.keys) < 2 or 2 * sentences.num_episodes < len(told)
     if by_word:
-        words = _words_by_picture(episodes)
+        words = words_by_picture(episodes)
         findings, tables = [_asked_by_word(words, episodes)], [_word_table(words)]
     else:
         findings, tables, figures, notes = _by_sentence(episodes, sentences)
-    ways = _ways(episodes)
+    ways = ways_of(episodes)
     left = len(told) - sentences.num_episodes
     if left and not by_word:
         few = plural(len(set(told)) - len(sentences.keys), "sentence")
@@ -108,22 +96,23 @@ def _about(episodes: DataEpisodes, number: int) -> list[str]:
 
 
 def _by_sentence(
-    episodes: DataEpisodes, sentences: _Sentences
+    episodes: DataEpisodes, sentences: Sentences
 ) -> tuple[list[Finding], list[Table], list[Figure], list[str]]:
     chosen = np.concatenate(sentences.members)
     order = np.argsort(chosen)
     groups = np.repeat(np.arange(len(sentences.keys)), [len(one) for one in sentences.members])[order]
     found = tell({name: look.of(chosen[order]) for name, look in episodes.looks.items()}, groups)
-    pairs = _pairs(episodes, sentences)
-    shared = _groups(pairs, sentences)
-    words = _words_by_pairs(pairs, sentences)
-    parts = _parting(episodes, sentences, pairs)
+    pairs = pairs_of(episodes, sentences)
+    shared = groups_of(pairs, sentences)
+    words = words_by_pairs(pairs, sentences)
+    parts = parting(episodes, sentences, pairs)
     pairs = pairs.join(parts, on=["first", "second"], how="left", maintain_order="left") if parts.height else pairs
-    notes = (
-        [f"{len(groups)} episodes begin in {found.scenes} ways that look different: what looks the same counts once."]
-        if found.scenes < len(groups)
-        else []
-    )
+    notes = []
+    if found.scenes < len(groups):
+        ways = f"{found.scenes} ways that look different"
+        notes.append(f"{len(groups)} episodes begin in {ways}: what looks the same counts once.")
+    if more := len(sentences.keys[MOST_SENTENCES:]):
+        notes.append(f"{plural(more, 'sentence')} of fewer episodes are not compared in pairs.")
     findings = [
         _must_read(found, groups, sentences, pairs),
         *_by_what(found),
@@ -131,7 +120,7 @@ def _by_sentence(
         *_cannot_be_learned(words),
         *_demonstrations(parts, episodes),
     ]
-    looks = [(name, *_estimate(_share(right, found.scenes))) for name, right in found.by_look.items()]
+    looks = [(name, *estimate_of(_share(right, found.scenes))) for name, right in found.by_look.items()]
     schema = {"look": pl.String, **dict.fromkeys(("told", "told_low", "told_high"), pl.Float64)}
     by_look = pl.DataFrame(looks, schema=schema, orient="row").sort("told", descending=True)
     tables = [
@@ -147,68 +136,12 @@ def _share(right: Any, scenes: int) -> Share:
     return Share.of(float(np.mean(right)), scenes)
 
 
-def _estimate(share: Share) -> tuple[float, float, float]:
-    return share.value, *share.interval()
-
-
-def _pairs(episodes: DataEpisodes, sentences: _Sentences) -> pl.DataFrame:
-    """Every pair of sentences: how well first pictures tell them apart, and what is shown of it."""
-    looks, some = list(episodes.looks.values()), range(min(len(sentences.keys), MOST_SENTENCES))
-    rows = []
-    with progress_bar(len(some) * (len(some) - 1) // 2, "pairs") as advance:
-        for a, b in combinations(some, 2):
-            share = tell_apart(looks, sentences.members[a], sentences.members[b])
-            sizes = len(sentences.members[a]), len(sentences.members[b])
-            names = sentences.names[a], sentences.names[b]
-            rows.append((a, b, *names, *sizes, *_estimate(share), share.p_less(LIMIT), share.p_more(LIMIT)))
-            advance(1)
-    frame = with_verdicts(pl.DataFrame(rows, schema=_PAIRS, orient="row")).sort("told", "first", "second")
-    differ = [_where_they_differ(one, other) for one, other in frame.select("sentence", "other").rows()]
-    return frame.with_columns(differ=pl.Series(differ, dtype=pl.String))
-
-
-def _where_they_differ(one: str, other: str) -> str:
-    """Two sentences without the words with which both begin and end."""
-    first, second = one.split(), other.split()
-    fewest = min(len(first), len(second)) - 1
-    begin = next((i for i in range(fewest) if first[i] != second[i]), fewest)
-    left = fewest - begin
-    end = next((i for i in range(left) if first[-1 - i] != second[-1 - i]), left)
-    parts = [" ".join(words[begin : len(words) - end]) for words in (first, second)]
-    return f"{'… ' if begin else ''}{parts[0]} / {parts[1]}{' …' if end else ''}"
-
-
-def with_verdicts(frame: pl.DataFrame) -> pl.DataFrame:
-    """Rows with p_less and p_more: their q over all rows, and which of the two is shown."""
-    shown = frame.with_columns(
-        pl.Series(f"q_{side}", adjusted_p_values(frame[f"p_{side}"].to_list()), dtype=pl.Float64)
-        for side in ("less", "more")
-    )
-    less, more = (pl.col(f"q_{side}") <= NAMED_AT for side in ("less", "more"))
-    verdict = pl.when(less).then(pl.lit(SHARED)).when(more).then(pl.lit(APART)).otherwise(pl.lit(OPEN))
-    return shown.with_columns(verdict=verdict)
-
-
-def _groups(pairs: pl.DataFrame, sentences: _Sentences) -> list[list[int]]:
-    """Groups of sentences, the largest first: each is shown to share scenes with another one, and is told from none."""
-    verdicts = {frozenset(row[:2]): row[2] for row in pairs.select("first", "second", "verdict").iter_rows()}
-    groups: list[list[int]] = []
-    for number in range(len(sentences.keys)):
-        found = [(group, [verdicts.get(frozenset((number, one))) for one in group]) for group in groups]
-        fitting = [group for group, of in found if SHARED in of and APART not in of]
-        if fitting:
-            max(fitting, key=len).append(number)
-        else:
-            groups.append([number])
-    return sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
-
-
 def _is_told(found: Told) -> bool:
     """Whether the sentence is told more often than in any of the ways to shuffle them: of null data, in 1 %."""
     return found.p * (SHUFFLES + 1) < 1.5
 
 
-def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.DataFrame) -> Finding:
+def _must_read(found: Told, groups: Labels, sentences: Sentences, pairs: pl.DataFrame) -> Finding:
     share, n, number = _share(found.right, found.scenes), len(groups), len(sentences.keys)
     low, high = share.interval()
     guess = float(np.bincount(groups).max() / n)
@@ -230,7 +163,7 @@ def _must_read(found: Told, groups: Labels, sentences: _Sentences, pairs: pl.Dat
         sentence = f"Only in part: the first picture alone tells {of} in {share.value:.0%} [{low:.0%}, {high:.0%}] of "
         sentence += f"{n} episodes {beside}; it explains {explains} of the sentences' entropy."
         advice = _advice(pairs)
-    numbers: dict[str, float | int | str | None] = {"told": share.value, "low": low, "high": high, "p": found.p}
+    numbers: Numbers = {"told": share.value, "low": low, "high": high, "p": found.p}
     numbers |= {"n": n, "guess": guess, "shuffled": float(found.shuffled.mean()), "explained": explained}
     return Finding(sentence, _MUST, numbers, f"{advice} {limit}".strip())
 
@@ -265,12 +198,11 @@ def _by_what(found: Told) -> list[Finding]:
     simple = sorted(alone, key=lambda one: (one[0].startswith("picture"), -one[1].value))
     name, share = next(one for one in simple if one[1].value >= best.interval()[0])
     said = f"The {name} alone tells it in {share.value:.0%} {_ends(share)}"
-    numbers: dict[str, float | int | str | None] = {"look": name, "told": share.value, "best": best_name}
+    numbers: Numbers = {"look": name, "told": share.value, "best": best_name}
     bright = [one for one in simple if one[0].startswith("brightness")]
     if name.startswith("picture") and bright:
-        said += (
-            f"; the {bright[0][0]} (mean and spread of its colours) in {bright[0][1].value:.0%} {_ends(bright[0][1])}"
-        )
+        dim, one = bright[0]
+        said += f"; the {dim} (mean and spread of its colours) in {one.value:.0%} {_ends(one)}"
     limit = "Was each task recorded on a day of its own, in a light of its own?" if name.startswith("bright") else ""
     return [Finding(f"{said}.", _BY_WHAT, numbers, limit)]
 
@@ -280,12 +212,12 @@ def _ends(share: Share) -> str:
     return f"[{low:.0%}, {high:.0%}]"
 
 
-def _where(pairs: pl.DataFrame, groups: list[list[int]], sentences: _Sentences) -> Finding:
+def _where(pairs: pl.DataFrame, groups: list[list[int]], sentences: Sentences) -> Finding:
     counts = {verdict: pairs.filter(verdict=verdict).height for verdict in (SHARED, APART, OPEN)}
-    numbers: dict[str, float | int | str | None] = {"shared": counts[SHARED], "apart": counts[APART], "n": pairs.height}
+    numbers: Numbers = {"shared": counts[SHARED], "apart": counts[APART], "n": pairs.height}
     needed = enough(LIMIT, pairs.height, NAMED_AT)
-    few = f"Of {plural(counts[OPEN], 'pair')} it is not known: {needed} episodes a sentence show it in 80% of cases." \
-        if counts[OPEN] else ""  # fmt: skip
+    few = f"Of {plural(counts[OPEN], 'pair')} it is not known: {needed} episodes a sentence show it in 80% of cases."
+    few = few if counts[OPEN] else ""
     if not groups:
         said = f"Nowhere that this look shows: it tells {counts[APART]} of {plural(pairs.height, 'pair')} of sentences "
         return Finding(f"{said}apart in more than {LIMIT:.0%}, none in less.", _WHERE, numbers, few)
@@ -307,46 +239,6 @@ def _named(names: Iterable[str]) -> str:
     return listing([f"'{name}'" for name in names], _NAMES)
 
 
-def _words_by_pairs(pairs: pl.DataFrame, sentences: _Sentences) -> pl.DataFrame:
-    """Of every word that is told where another of its kind could be: whether scenes are shared, or tell it."""
-    by_kind = [words_by_kind(name) for name in sentences.names]
-    verdicts: dict[tuple[str, str], list[str]] = {}
-    for first, second, verdict in pairs.select("first", "second", "verdict").iter_rows():
-        for kind in KINDS:
-            one, other = by_kind[first][kind], by_kind[second][kind]
-            for word in (one ^ other) if one and other else ():
-                verdicts.setdefault((kind, word), []).append(verdict)
-    rows = []
-    for (kind, word), found in verdicts.items():
-        n = sum(len(sentences.members[i]) for i, words in enumerate(by_kind) if word in words[kind])
-        verdict = SHARED if SHARED in found else APART if set(found) == {APART} else OPEN
-        rows.append((kind, word, n, found.count(SHARED), len(found), verdict, None, None, None))
-    return pl.DataFrame(rows, schema=_WORD_SCHEMA, orient="row").sort("verdict", "kind", "word")
-
-
-def _words_by_picture(episodes: DataEpisodes) -> pl.DataFrame:
-    """Of every word, whether the picture tells it from other words of its kind."""
-    by_kind = [words_by_kind(sentence) for sentence in episodes.sentences]
-    looks, rows = list(episodes.looks.values()), []
-    words = [(kind, word) for kind in KINDS for word in sorted(set().union(*(one[kind] for one in by_kind)))]
-    with progress_bar(len(words), "words") as advance:
-        for kind, word in words:
-            told = np.array([word in one[kind] for one in by_kind])
-            other = np.array([bool(one[kind]) for one in by_kind]) & ~told
-            if min(told.sum(), other.sum()) >= FEWEST:
-                share = tell_apart(looks, np.flatnonzero(told), np.flatnonzero(other))
-                tests = share.p_less(LIMIT), share.p_more(LIMIT)
-                rows.append((kind, word, int(told.sum()), *_estimate(share), *tests))
-            advance(1)
-    columns = ("told", "told_low", "told_high", "p_less", "p_more")
-    schema = {"kind": pl.String, "word": pl.String, "num_episodes": pl.Int64, **dict.fromkeys(columns, pl.Float64)}
-    found = with_verdicts(pl.DataFrame(rows, schema=schema, orient="row"))
-    return found.select(
-        "kind", "word", "num_episodes", pl.lit(None, pl.Int64).alias("shared"), pl.lit(None, pl.Int64).alias("pairs"),
-        "verdict", *columns[:3],
-    ).sort("verdict", "kind", "word")  # fmt: skip
-
-
 def _asked_by_word(words: pl.DataFrame, episodes: DataEpisodes) -> Finding:
     apart, shared, unclear = (words.filter(verdict=one)["word"].to_list() for one in (APART, SHARED, OPEN))
     n = len(episodes.sentences)
@@ -359,7 +251,7 @@ def _asked_by_word(words: pl.DataFrame, episodes: DataEpisodes) -> Finding:
     said += f" ({_named(apart)})" if apart else ""
     said += f", {len(shared)} share scenes with others of their kind" + (f" ({_named(shared)})" if shared else "")
     said += f", of {len(unclear)} it is not known."
-    numbers: dict[str, float | int | str | None] = {"apart": len(apart), "shared": len(shared), "n": n}
+    numbers: Numbers = {"apart": len(apart), "shared": len(shared), "n": n}
     return Finding(said, _MUST, numbers, _WEAK)
 
 
@@ -367,7 +259,7 @@ def _cannot_be_learned(words: pl.DataFrame) -> list[Finding]:
     if words.is_empty():
         return []
     apart, shared = (words.filter(verdict=one) for one in (APART, SHARED))
-    numbers: dict[str, float | int | str | None] = {"apart": apart.height, "shared": shared.height, "n": words.height}
+    numbers: Numbers = {"apart": apart.height, "shared": shared.height, "n": words.height}
     said = []
     if shared.height:
         said.append(f"In the scenes of {_named(shared['word'])} another word is told in its place, too.")
@@ -379,37 +271,12 @@ def _cannot_be_learned(words: pl.DataFrame) -> list[Finding]:
     return [Finding(" ".join(said) or f"Not known of any of {plural(words.height, 'word')}.", _WORDS, numbers)]
 
 
-def _parting(episodes: DataEpisodes, sentences: _Sentences, pairs: pl.DataFrame) -> pl.DataFrame:
-    """Of pairs that share scenes: from which moment on what was done tells them apart."""
-    shared = pairs.filter(verdict=SHARED).head(_MOST_PAIRS).select("first", "second").rows()
-    if episodes.motions is None or not shared:
-        return pl.DataFrame(schema=_PARTS)
-    rows = []
-    with progress_bar(len(shared), "pairs of actions") as advance:
-        moments = [looks_of_motion(episodes, moment) for moment in range(len(episodes.moments))]
-        for first, second in shared:
-            for moment, looks in zip(episodes.moments.tolist(), moments, strict=True):
-                share = tell_apart(looks, sentences.members[first], sentences.members[second])
-                tests = share.p_less(LIMIT), share.p_more(LIMIT)
-                rows.append((first, second, moment, *_estimate(share), *tests))
-            advance(1)
-    names = ("done", "done_low", "done_high", "p_less", "p_more")
-    schema = {"first": pl.Int64, "second": pl.Int64, "moment": pl.Float64, **dict.fromkeys(names, pl.Float64)}
-    each = with_verdicts(pl.DataFrame(rows, schema=schema, orient="row"))
-    last = pl.col("moment") == pl.col("moment").max()
-    return each.group_by("first", "second", maintain_order=True).agg(
-        pl.col("moment").filter(pl.col("verdict") == APART).min().alias("parts_at"),
-        *(pl.col(name).filter(last).first() for name in names[:3]),
-        (pl.col("verdict") == SHARED).all().alias("the_same"),
-    )
-
-
 def _demonstrations(parts: pl.DataFrame, episodes: DataEpisodes) -> list[Finding]:
     if parts.is_empty():
         return []
     differ, same = parts.drop_nulls("parts_at"), parts.filter("the_same").height
     n, unit, until = parts.height, episodes.unit, episodes.moments[-1]
-    numbers: dict[str, float | int | str | None] = {"differ": differ.height, "same": same, "n": n}
+    numbers: Numbers = {"differ": differ.height, "same": same, "n": n}
     rest = (
         f"in {same} they do not differ until {until:.2g} {unit} (told apart in less than {LIMIT:.0%})" if same else ""
     )
@@ -423,31 +290,10 @@ def _demonstrations(parts: pl.DataFrame, episodes: DataEpisodes) -> list[Finding
     return [Finding(f"{said}{'; ' + rest if rest else ''}.", _ACTIONS, numbers)]
 
 
-def _ways(episodes: DataEpisodes) -> pl.DataFrame:
-    """What is said, by the words with a meaning of their own; in how many ways, and how often in the commonest."""
-    counts = Counter(sentence for sentence in episodes.sentences if sentence)
-    meanings: dict[tuple[frozenset[str], ...], list[str]] = {}
-    for sentence in counts:
-        meanings.setdefault(tuple(words_by_kind(sentence).values()), []).append(sentence)
-    rows = []
-    for same in meanings.values():
-        first, n = max(same, key=counts.__getitem__), sum(counts[one] for one in same)
-        name = visible(episodes.written[first].most_common(1)[0][0])
-        rows.append((name, len(same), len(first.split()), n, counts[first] / n))
-    schema = {
-        "sentence": pl.String,
-        "ways": pl.Int64,
-        "words": pl.Int64,
-        "num_episodes": pl.Int64,
-        "commonest": pl.Float64,
-    }
-    return pl.DataFrame(rows, schema=schema, orient="row").sort("num_episodes", "sentence", descending=[True, False])
-
-
 def _said_in_ways(ways: pl.DataFrame) -> Finding:
     sentences, several = int(ways["ways"].sum()), ways.filter(pl.col("ways") > 1)
     vocabulary = {word for name in ways["sentence"] for word in name.lower().split()}
-    numbers: dict[str, float | int | str | None] = {"sentences": sentences, "meanings": ways.height}
+    numbers: Numbers = {"sentences": sentences, "meanings": ways.height}
     limit = (
         f"{plural(len(vocabulary), 'word')} in all. Counted by words with a meaning of their own: synonyms are others."
     )
@@ -475,12 +321,12 @@ def _faults(episodes: DataEpisodes) -> list[Finding]:
         parts.append(f"in {plural(episodes.several, 'episode')} more than one sentence is told: the first counts")
     if empty:
         parts.append(f"in {plural(empty, 'episode')} nothing is told: left out")
-    numbers: dict[str, float | int | str | None] = {"otherwise": len(otherwise), "several": episodes.several}
+    numbers: Numbers = {"otherwise": len(otherwise), "several": episodes.several}
     said = "; ".join(parts)
     return [Finding(f"{said[0].upper()}{said[1:]}.", _FAULTS, numbers | {"empty": empty})] if parts else []
 
 
-def _matrix(pairs: pl.DataFrame, sentences: _Sentences, episodes: DataEpisodes) -> Figure:
+def _matrix(pairs: pl.DataFrame, sentences: Sentences, episodes: DataEpisodes) -> Figure:
     """Pair by pair, those that share scenes first, with a first picture of each sentence."""
     order = [*dict.fromkeys(number for row in pairs.select("first", "second").rows() for number in row)][:_IN_PICTURE]
     both = pl.concat([
@@ -511,19 +357,6 @@ def _word_table(words: pl.DataFrame) -> Table:
 
 #: Sentences in the picture; the largest part of the entropy that is said as a number.
 _IN_PICTURE, _ALL = 24, 0.99
-_PAIRS: Mapping[str, Any] = {
-    "first": pl.Int64, "second": pl.Int64, "sentence": pl.String, "other": pl.String, "num_first": pl.Int64,
-    "num_second": pl.Int64, "told": pl.Float64, "told_low": pl.Float64, "told_high": pl.Float64,
-    "p_less": pl.Float64, "p_more": pl.Float64,
-}  # fmt: skip
-_PARTS: Mapping[str, Any] = {
-    "first": pl.Int64, "second": pl.Int64, "parts_at": pl.Float64, "done": pl.Float64, "done_low": pl.Float64,
-    "done_high": pl.Float64, "the_same": pl.Boolean,
-}  # fmt: skip
-_WORD_SCHEMA: Mapping[str, Any] = {
-    "kind": pl.String, "word": pl.String, "num_episodes": pl.Int64, "shared": pl.Int64, "pairs": pl.Int64,
-    "verdict": pl.String, "told": pl.Float64, "told_low": pl.Float64, "told_high": pl.Float64,
-}  # fmt: skip
 _TOLD = [Column("told", "percent", "told by picture", "mean of both groups' shares of right answers; guessing is 50%")]
 _PAIR_COLUMNS = [
     Column("differ", "text", "sentences"),

@@ -13,8 +13,9 @@ import vla_attention as va
 from tests.kit.lerobot_data_sets import MadeUpEpisode, write_data_set
 from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.commands.data import APART, OPEN, SHARED, data
+from vla_attention.analyze.commands.data import data
 from vla_attention.analyze.core.data_episodes import Episode, collected
+from vla_attention.analyze.core.shared_scenes import APART, OPEN, SHARED
 from vla_attention.schemas.errors import UserError
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
