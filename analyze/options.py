@@ -199,9 +199,10 @@ def _path_of(store: StorePlace) -> Path:
     if isinstance(store, Path):
         # `..` would lead out of `results`, and behind a link it is not the folder above.
         place = Path(os.path.realpath(store)) if ".." in store.parts else store.absolute()
-        if place.suffix == STORE_SUFFIX and Path.cwd() in place.parents:
+        is_below = Path.cwd() in place.parents
+        if place.suffix == STORE_SUFFIX and is_below:
             return place.relative_to(Path.cwd()).with_suffix("")
-        parts, whole = place.relative_to(place.anchor).parts, str(place)
+        parts, whole = place.relative_to(Path.cwd() if is_below else place.anchor).parts, str(place)
     else:
         whole = str(store)
         parts = tuple(part for part in whole.split("://", 1)[1].split("/") if part not in ("", ".", ".."))
