@@ -247,12 +247,11 @@ def _asked_by_word(words: pl.DataFrame, episodes: DataEpisodes) -> Finding:
         return Finding(
             f"{begin}: no word is told in {FEWEST} of {n} episodes and another of its kind in as many.", _MUST
         )
-    said = f"{begin}: of {words.height} words the first picture tells {len(apart)}"
-    said += f" ({_named(apart)})" if apart else ""
-    said += f", {len(shared)} share scenes with others of their kind" + (f" ({_named(shared)})" if shared else "")
-    said += f", of {len(unclear)} it is not known."
+    parts = [f"the first picture tells {_named(apart)} from other words of their kind"] if apart else []
+    parts += [f"{_named(shared)} are told in the same scenes as others"] if shared else []
+    parts += [f"of {plural(len(unclear), 'word')} it is not known"] if unclear else []
     numbers: Numbers = {"apart": len(apart), "shared": len(shared), "n": n}
-    return Finding(said, _MUST, numbers, _WEAK)
+    return Finding(f"{begin}: {'; '.join(parts)}.", _MUST, numbers, _WEAK)
 
 
 def _cannot_be_learned(words: pl.DataFrame) -> list[Finding]:

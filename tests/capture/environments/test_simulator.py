@@ -32,6 +32,10 @@ def test_a_context_serves_a_model_with_bodies_elsewhere_and_no_other() -> None:
     assert draw_alike(model(), model())
     assert draw_alike(model(), moved)
     assert draw_alike(hidden, model())
+    without_area = model(), model()
+    for one in without_area:
+        one.geom_rgba[:] = np.nan  # as the normals of some of LIBERO's meshes
+    assert draw_alike(*without_area)
     assert not draw_alike(model(), model(size=1.1))
     assert not draw_alike(model(), model(far=40))
     # The size of the whole scene is in a context: how far shadows and fog reach.
