@@ -148,7 +148,7 @@ def _must_read(found: Told, groups: Labels, sentences: Sentences, pairs: pl.Data
     # The lower end: its error is that of as many answers as the share's.
     error = float(found.gained.std()) / math.sqrt(share.effective)
     explained = max(0.0, float(found.gained.mean()) - 1.96 * error) / found.entropy
-    explains = f"more than {_ALL:.0%}" if explained > _ALL else f"at least {explained:.0%}"
+    explains = _at_least(explained)
     beside = f"(guessing: {guess:.0%}; shuffled sentences: at most {found.shuffled.max():.0%})"
     of = f"which of {number} sentences was given"
     advice, limit = "", _WEAK
@@ -156,7 +156,7 @@ def _must_read(found: Told, groups: Labels, sentences: Sentences, pairs: pl.Data
         sentence = f"Perhaps: this look does not tell {of}: right in {share.value:.0%} of {n} episodes, in at most "
         sentence += f"{high:.0%} {beside}."
     elif low >= TELLS:
-        sentence = f"No: the first picture alone tells {of}, in at least {low:.0%} of {n} episodes {beside}; it "
+        sentence = f"No: the first picture alone tells {of}, in {_at_least(low)} of {n} episodes {beside}; it "
         sentence += f"explains {explains} of the sentences' entropy."
         advice, limit = _advice(pairs), ""
     else:
@@ -166,6 +166,10 @@ def _must_read(found: Told, groups: Labels, sentences: Sentences, pairs: pl.Data
     numbers: Numbers = {"told": share.value, "low": low, "high": high, "p": found.p}
     numbers |= {"n": n, "guess": guess, "shuffled": float(found.shuffled.mean()), "explained": explained}
     return Finding(sentence, _MUST, numbers, f"{advice} {limit}".strip())
+
+
+def _at_least(share: float) -> str:
+    return f"more than {_ALL:.0%}" if share > _ALL else f"at least {share:.0%}"
 
 
 def _advice(pairs: pl.DataFrame) -> str:
@@ -354,7 +358,7 @@ def _word_table(words: pl.DataFrame) -> Table:
     return Table("words", words, columns, "Word by word")
 
 
-#: Sentences in the picture; the largest part of the entropy that is said as a number.
+#: Sentences in the picture; the largest share that is said as it is.
 _IN_PICTURE, _ALL = 24, 0.99
 _TOLD = [Column("told", "percent", "told by picture", "mean of both groups' shares of right answers; guessing is 50%")]
 _PAIR_COLUMNS = [

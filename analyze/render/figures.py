@@ -393,6 +393,8 @@ def _scatter(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
 #: The colours of a map: less than uniform attention (as the linguistic group), as much, more (as the visual group), and
 #: no value. They span at least this factor on either side of 1: tiny differences must not look large.
 _STOPS, _NO_VALUE, _LEAST_FACTOR = ("#A63C00", "#E69A6B", "#F7F7F7", "#7FB2D3", "#00507D"), "#D9D9D9", 1.4
+#: Height of a row with a picture, in inches.
+_ROW = 0.42
 #: With more cells than this, numbers in them could not be read; with more in a row, they would touch.
 _MOST_NUMBERS, _MOST_NUMBERED_COLUMNS = 64, 12
 
@@ -430,17 +432,30 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> float:
     bar.set_label(wrapped(o.get("label", o["value"]), 20, 3))
     bar.outline.set_visible(False)
     label_positions(axes.xaxis, [str(one) for one in columns], _most_labels(axes))
-    label_positions(axes.yaxis, [str(one) for one in lines], _MOST_LABELS)
+    beside = o.get("beside")
+    label_positions(axes.yaxis, [wrapped(str(one), 36, 3) if beside else str(one) for one in lines], _MOST_LABELS)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    if beside := o.get("beside"):
-        for row, line in enumerate(lines):
-            corner = axes.inset_axes((-0.1, row / len(lines), 0.09, 0.92 / len(lines)))
-            corner.imshow(beside[line])
-            corner.set_axis_off()
-        axes.tick_params(axis="y", pad=34)
-        return 0.9 + min(8.0, 0.42 * len(lines))
+    if beside:
+        _pictures_beside(axes, [beside[line] for line in lines])
+        return 0.9 + _ROW * len(lines)
     return 0.9 + min(6.0, 0.3 * len(lines))
+
+
+def _pictures_beside(axes: Axes, shown: Sequence[NDArray[np.uint8]]) -> None:
+    """A picture between each row's label and its cells."""
+    from matplotlib.offsetbox import AnnotationBbox, OffsetImage
+
+    side = 0.9 * 72 * _ROW  # in points
+    for row, picture in enumerate(shown):
+        image = OffsetImage(picture, zoom=side / max(picture.shape[:2]))
+        axes.add_artist(
+            AnnotationBbox(
+                image, (0, row), (-0.6 * side, 0), ("axes fraction", "data"), boxcoords="offset points", frameon=False,
+                pad=0, annotation_clip=False,
+            )
+        )  # fmt: skip
+    axes.tick_params(axis="y", pad=1.2 * side)
 
 
 def _most_labels(axes: Axes) -> int:
