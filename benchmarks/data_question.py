@@ -9,7 +9,8 @@ pictures, states and actions of demonstrations, with sentences dealt out anew; `
 `noise`, pictures and actions of random numbers. Planted kinds, with shuffled sentences: `marked`, a mark in the picture
 says the sentence (`scene.paste_mark`); `half`, of three sentences; `half-marked`, in half of each sentence's episodes,
 so that the picture cannot tell two sentences apart in more than 75 %, at which nothing may be said of a pair;
-`acted`, actions that differ from the fourth of eight moments on.
+`lit`, light that grows from episode to episode, each sentence
+recorded after the other; `acted`, actions that differ from the fourth of eight moments on.
 
 `named` is a first line that begins with "No" or "Only in part", a pair told apart, words that nothing makes a policy
 read, or actions that differ.
@@ -38,7 +39,7 @@ from tests.kit.lerobot_data_sets import MadeUpEpisode, write_data_set
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.environments.cubes.scene import paste_mark
 
-NULL, PLANTED = ("shuffled", "black", "noise"), ("marked", "half", "half-marked", "acted")
+NULL, PLANTED = ("shuffled", "black", "noise"), ("marked", "half", "half-marked", "lit", "acted")
 SENTENCES = tuple(f"{verb} the {colour} cube" for verb in ("touch", "lift") for colour in ("red", "green", "blue"))
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 MOMENTS = 8
@@ -69,6 +70,9 @@ def episodes_of(kind: str, starts: Sequence[Any], per_sentence: int, rng: np.ran
         )
         if is_marked:
             front = paste_mark(front, sentence % 3, sentence // 3)
+        if kind == "lit":
+            light = 0.7 + 0.6 * (sentence + rng.random()) / len(SENTENCES)
+            front, wrist = (np.clip(one * light, 0, 255).astype(np.uint8) for one in (front, wrist))
         if kind == "acted":
             actions = actions.copy()
             actions[MOMENTS // 2 :, 0] += np.std(actions) * 4 * sentence
@@ -108,6 +112,7 @@ def asked(kind: str, starts: Sequence[Any], per_sentence: int, draw: int) -> dic
         "the picture tells all": must["sentence"].startswith("No:"),
         "a pair told apart": bool(pairs.filter(verdict="told apart").height),
         "words": said_words,
+        "brightness": findings.get("By what?", {"sentence": ""})["sentence"].startswith("The brightness"),
         "actions differ": bool(differ.get("differ")),
     }
     named = any(found[name] for name in ("the picture tells", "a pair told apart", "words", "actions differ"))

@@ -87,11 +87,12 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     return open_stores(stores)
 
 
-def data(place: str | Path, num_episodes: int | None = None) -> Answer:
+def data(place: str | Path, num_episodes: int | None = None, encoder: Callable[[Any], Any] | None = None) -> Answer:
     """Return what the first pictures of a data set tell of its sentences, before anything is trained on it.
 
     `place`: a LeRobotDataset (a folder, `ORG/NAME` or `ORG/NAME@REVISION`) or a store. `num_episodes`: so many, evenly
-    over all; 5,000 at most without it. Tables "pairs", "words", "looks" and "ways".
+    over all; 5,000 at most without it. `encoder`: one more look, from a picture (height, width, 3) uint8 to numbers, as
+    the features of a network. Tables "pairs", "words", "looks" and "ways".
 
     >>> va.data(store)["ways"]["sentence"].len()
     2
@@ -105,7 +106,7 @@ def data(place: str | Path, num_episodes: int | None = None) -> Answer:
     from vla_attention.analyze.core.data_episodes import read_episodes
     from vla_attention.analyze.render.answer import Answer
 
-    return Answer.of(answer(read_episodes(place, num_episodes)))
+    return Answer.of(answer(read_episodes(place, num_episodes, encoder)))
 
 
 def example(name: str) -> Path:

@@ -6,7 +6,7 @@ Of each episode little is kept: small pictures, the first state, and sixteen mom
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +27,8 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_url import store_place
 
 Picture: TypeAlias = NDArray[np.uint8]
+#: A look of the user's own: picture (height, width, 3) -> (number,).
+Encoder: TypeAlias = Callable[[Picture], NDArray[np.floating]]
 #: Without `num_episodes`: what matrices of (episode, episode) still do in minutes.
 MOST_EPISODES = 5000
 #: Moments at which actions are looked at, to the median length of the episodes.
@@ -36,6 +38,8 @@ _SMALL, _EDGES, _SHOWN = 8, 64, 96
 #: Looks that are not of one camera.
 FIRST_STATE, EVERYTHING, EVERYTHING_CURVED = "first state", "all of it", "all of it, curved"
 _TINY = 1e-9
+#: What names of cameras of a LeRobotDataset begin with, and nobody says.
+_PREFIX = "observation.images."
 
 
 @dataclass(frozen=True)
@@ -87,10 +91,10 @@ class Episode:
     states: Array | None
 
 
-def read_episodes(place: str | Path, num_episodes: int | None = None) -> DataEpisodes:
+def read_episodes(place: str | Path, num_episodes: int | None = None, encoder: Encoder | None = None) -> DataEpisodes:
     """Read a data set (a folder, `ORG/NAME`) or a store; a bar shows progress at a terminal.
 
-    num_episodes: so many of them, evenly over all; None: all, `MOST_EPISODES` at most.
+    num_episodes: so many of them, evenly over all; None: all, `MOST_EPISODES` at most. encoder: one more look.
 
     Raises:
         DataSetError, StoreError: it cannot be read.
@@ -103,13 +107,15 @@ def read_episodes(place: str | Path, num_episodes: int | None = None) -> DataEpi
         store = open_store(store_place(str(place)))
         chosen = _spread(store.episodes, most)
         moments = _moments([one.attributes.num_steps for one in chosen])
-        return collected(store.suite, len(store.episodes), len(chosen), _of_store(store, chosen), moments, "steps")
+        return collected(
+            store.suite, len(store.episodes), len(chosen), _of_store(store, chosen), moments, "steps", encoder
+        )
     data = open_dataset(place)
     numbers = _spread(data.episode_numbers, most)
     data.check_files(numbers, data.cameras)
     moments = _moments([data.entry(number).length for number in numbers]) / data.fps
     episodes = _of_data_set(data, numbers)
-    return collected(data.name, len(data.episode_numbers), len(numbers), episodes, moments, "s")
+    return collected(data.name, len(data.episode_numbers), len(numbers), episodes, moments, "s", encoder)
 
 
 def _moments(lengths: Sequence[int]) -> Array:
@@ -156,7 +162,13 @@ def _of_store(store: Store, chosen: Sequence[StoredEpisode]) -> Iterator[Episode
 
 
 def collected(
-    name: str, total: int, number: int, episodes: Iterator[Episode], moments: Array, unit: str
+    name: str,
+    total: int,
+    number: int,
+    episodes: Iterator[Episode],
+    moments: Array,
+    unit: str,
+    encoder: Encoder | None = None,
 ) -> DataEpisodes:
     """What is kept of episodes that are read one after the other.
 
@@ -167,10 +179,12 @@ def collected(
         episodes: those.
         moments: (moment,) at which actions are looked at.
         unit: of the moments.
+        encoder: one more look at each picture.
     """
     sentences: list[str] = []
     written: dict[str, Counter[str]] = {}
     small: dict[str, list[Array]] = {}
+    encoded: dict[str, list[Array]] = {}
     shown: dict[str, tuple[Picture, ...]] = {}
     states, motions, several = [], [], 0
     with progress_bar(number, "episodes") as advance:
@@ -184,6 +198,8 @@ def collected(
                 )
             for camera, picture in episode.images.items():
                 small.setdefault(camera, []).append(_small(picture))
+                if encoder is not None:
+                    encoded.setdefault(camera, []).append(np.asarray(encoder(picture), dtype=np.float64).ravel())
             if sentence not in shown:
                 shown[sentence] = tuple(_resized(picture, _SHOWN) for picture in episode.images.values())
             written.setdefault(sentence, Counter())[episode.instruction.strip()] += 1
@@ -200,14 +216,18 @@ def collected(
         tuple(sentences),
         written,
         several,
-        tuple(camera.rpartition(".")[2] for camera in small),
+        tuple(camera.removeprefix(_PREFIX) for camera in small),
         _size(states),
-        _looks({camera: np.stack(one) for camera, one in small.items()}, states),
+        _looks(_stacked(small), _stacked(encoded), states),
         shown,
         np.stack(known, axis=1) if even else None,
         moments,
         unit,
     )
+
+
+def _stacked(of: Mapping[str, Sequence[Array]]) -> dict[str, Array]:
+    return {camera: np.stack(numbers) for camera, numbers in of.items()}
 
 
 def _size(states: Sequence[Array]) -> str:
@@ -234,16 +254,19 @@ def _resized(picture: Picture, side: int) -> Picture:
     return np.asarray(Image.fromarray(picture).resize((side, side), Image.Resampling.BOX))
 
 
-def _looks(small: Mapping[str, Array], states: Sequence[Array]) -> dict[str, Look]:
+def _looks(small: Mapping[str, Array], encoded: Mapping[str, Array], states: Sequence[Array]) -> dict[str, Look]:
     """The looks, of numbers with a mean square norm of 1; what is the same in all episodes tells nothing."""
     looks, blocks = {}, []
     for camera, numbers in small.items():
         colours, edges, whole = np.split(numbers, [3 * _SMALL**2, 4 * _SMALL**2], axis=1)
         block = _scaled(np.concatenate([_scaled(colours), _scaled(edges)], axis=1))
-        short = camera.rpartition(".")[2]
+        short = camera.removeprefix(_PREFIX)
         looks[f"picture of {short}"] = Look(block)
         looks[f"brightness of {short}"] = Look(_standard(whole), curved=True)
         blocks.append(block)
+    for camera, numbers in encoded.items():
+        blocks.append(_scaled(_standard(numbers)))
+        looks[f"encoder of {camera.removeprefix(_PREFIX)}"] = Look(blocks[-1])
     if len({len(state) for state in states}) == 1 and len(states[0]):
         blocks.append(_scaled(_standard(np.stack(states))))
         looks[FIRST_STATE] = Look(blocks[-1], curved=True)

@@ -36,10 +36,10 @@ def episode(sentence, rng, *, spot=None, light=0, turn=0.0, several=False):
     return Episode(sentence, several, images, rng.normal(size=3), actions, times, None)
 
 
-def asked(episodes):
+def asked(episodes, encoder=None):
     """The answer, and its findings by what they ask."""
     moments = np.arange(1, 9) / 8 * FRAMES / 8
-    answer = data(collected("made up", len(episodes), len(episodes), iter(episodes), moments, "s"))
+    answer = data(collected("made up", len(episodes), len(episodes), iter(episodes), moments, "s", encoder))
     return answer, {one.asks: one for one in answer.findings}
 
 
@@ -123,6 +123,18 @@ def test_light_that_drifts_while_tasks_are_recorded_one_after_the_other():
     assert found[MUST].sentence.startswith(("No:", "Only in part:"))
     assert found["By what?"].numbers["look"].startswith("brightness of")
     assert "light of its own" in found["By what?"].limit
+
+
+def test_an_encoder_sees_what_small_pictures_do_not():
+    """A dot of one pixel in noise."""
+    rng = np.random.default_rng(13)
+    made = [episode(text, rng) for _ in range(15) for text in CUPS[:2]]
+    for one in made:
+        one.images[FRONT][5, 5] = 118 if one.instruction == CUPS[0] else 62
+    _, without = asked(made)
+    _, found = asked(made, encoder=lambda picture: picture[5, 5])
+    assert found["By what?"].numbers["look"] == "encoder of front"
+    assert found[MUST].numbers["told"] > 0.95 > without[MUST].numbers["told"]
 
 
 def test_a_black_camera_and_one_scene_for_all():
