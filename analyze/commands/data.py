@@ -234,9 +234,9 @@ def _where(pairs: pl.DataFrame, groups: list[list[int]], sentences: Sentences) -
         said = "; ".join(f"{_named(sentences.names[one] for one in group)} share scenes" for group in groups[:2])
         said += f"; {len(groups) - 2} more groups do" if len(groups) > 2 else ""
     shown = sum(row["verdict"] == SHARED for row in of_groups)
-    said += f": the picture tells two of them apart in {mean:.0%} (guessing: 50%; less than "
-    numbers |= {"groups": len(groups), "inside": mean}
-    return Finding(f"{said}{LIMIT:.0%} is shown of {shown} of {plural(len(of_groups), 'pair')}).", _WHERE, numbers, few)
+    said += f": the picture tells two of them apart in {mean:.0%} (guessing: 50%; less than {LIMIT:.0%} is shown for "
+    said += "each pair)" if shown == len(of_groups) else f"{shown} of {len(of_groups)} pairs)"
+    return Finding(f"{said}.", _WHERE, numbers | {"groups": len(groups), "inside": mean}, few)
 
 
 def _named(names: Iterable[str]) -> str:
@@ -287,7 +287,8 @@ def _demonstrations(parts: pl.DataFrame, episodes: DataEpisodes) -> list[Finding
         said = f"Not shown in any of {plural(n, 'pair')} that share scenes" + (f"; {rest}" if rest else "")
         return [Finding(f"{said}.", _ACTIONS, numbers)]
     half = float(differ["parts_at"].quantile(0.5, "higher") or 0.0)
-    said = f"Yes, in {differ.height} of {plural(n, 'pair')} that share scenes, half of them by {half:.2g} {unit}: what "
+    many = "half of them by" if differ.height > 1 else "by"
+    said = f"Yes, in {differ.height} of {plural(n, 'pair')} that share scenes, {many} {half:.2g} {unit}: what "
     said += f"was done tells the sentences apart in more than {LIMIT:.0%} (two demonstrations of one sentence: 50%)"
     numbers |= {"parts_at": half}
     return [Finding(f"{said}{'; ' + rest if rest else ''}.", _ACTIONS, numbers)]
