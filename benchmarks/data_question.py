@@ -12,7 +12,7 @@ so that the picture cannot tell two sentences apart in more than 75 %, at which 
 `lit`, light that grows from episode to episode, each sentence
 recorded after the other; `acted`, actions that differ from the fourth of eight moments on.
 
-`named` is a first line that begins with "No" or "Only in part", a pair told apart, words that nothing makes a policy
+`named` is a first line that begins with "No" or "Only in part", a pair told apart, words that little makes a policy
 read, or actions that differ.
 """
 
@@ -106,12 +106,12 @@ def asked(kind: str, starts: Sequence[Any], per_sentence: int, draw: int) -> dic
         for name, part in of.items()
         for verdict in ("share scenes", "told apart")
     }
-    said_words = "Nothing makes" in findings.get("Which words?", {"sentence": ""})["sentence"]
+    words = findings.get("Which words?", {"numbers": {}})["numbers"].get("apart", 0)
     found = {
         "the picture tells": must["sentence"].startswith(("No:", "Only in part:")),
         "the picture tells all": must["sentence"].startswith("No:"),
         "a pair told apart": bool(pairs.filter(verdict="told apart").height),
-        "words": said_words,
+        "words": words > 0,
         "brightness": findings.get("By what?", {"sentence": ""})["sentence"].startswith("The brightness"),
         "actions differ": bool(differ.get("differ")),
     }
