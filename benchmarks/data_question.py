@@ -116,7 +116,7 @@ def asked(kind: str, starts: Sequence[Any], per_sentence: int, draw: int) -> dic
         "actions differ": bool(differ.get("differ")),
     }
     named = any(found[name] for name in ("the picture tells", "a pair told apart", "words", "actions differ"))
-    return {"named": named, **found, **counts, "told": must["numbers"]["told"]}
+    return {"named": named, **found, **counts, "told": must["numbers"]["told"], "pairs told": pairs["told"].mean()}
 
 
 def table(kind: str, per_sentence: int, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -268,8 +268,8 @@ def _cannot_be_learned(words: pl.DataFrame) -> list[Finding]:
         said.append(f"In the scenes of {_named(shared['word'])} another word is told in its place, too.")
     if apart.height:
         said.append(
-            f"Little makes a policy read {_named(apart['word'])}: the picture tells sentences with one of them from those "
-            f"with another word there, in more than {LIMIT:.0%} each."
+            f"Little makes a policy read {_named(apart['word'])}: the picture tells sentences with one of them from "
+            f"those with another word there, in more than {LIMIT:.0%} each."
         )
     return [Finding(" ".join(said) or f"Not known of any of {plural(words.height, 'word')}.", _WORDS, numbers)]
 
