@@ -42,6 +42,9 @@ def test_the_shipped_pair(store, right, p):
     assert (found.findings[0].numbers["right"], found.findings[0].numbers["n"]) == (right, 6)
     assert found.findings[0].numbers["p"] == pytest.approx(p)
     assert found["told_and_did"]["episodes"].sum() == 6
+    # One that does not listen is asked what it was trained on.
+    asks_the_data = found.findings[0].next_step.startswith("vla-attention data ")
+    assert asks_the_data == (store == "cubes_one_colour")
     if store == "cubes_one_colour":
         assert "blue cube" in found.findings[0].sentence
 
