@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.analyze.options import (
     INSTEAD,
+    OPTIONS,
     add_output,
     add_question,
     results_folder,
@@ -47,10 +48,20 @@ def question_parser(name: str) -> OneSentenceParser:
         return parser
     else:
         parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
-    parser.instead = INSTEAD
+    parser.instead = INSTEAD | _of_other_questions(command)
     add_question(parser, command.options)
     add_output(parser, name, command.page)
     return parser
+
+
+def _of_other_questions(command: Command) -> dict[str, str]:
+    """Options that this question has not -> which have them."""
+    others = {option: [name for name, one in COMMANDS.items() if option in one.options] for option in OPTIONS}
+    return {
+        f"--{option.replace('_', '-')}": f"It is an option of {' and '.join(names)}."
+        for option, names in others.items()
+        if names and option not in command.options
+    }
 
 
 def run_question(name: str, given: argparse.Namespace) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import textwrap
 import warnings
@@ -46,6 +47,10 @@ class _HelpAll(argparse.Action):
 class _WideHelp(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=26, width=_HELP_WIDTH)
+
+
+#: What argparse says of a value that is none of its choices.
+_CHOICE = re.compile(r"invalid choice: '(.*)' \(choose from (.*)\)")
 
 
 class OneSentenceParser(argparse.ArgumentParser):
@@ -109,7 +114,9 @@ class OneSentenceParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the problem and where help is; exit code 2."""
-        self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
+        wrong = _CHOICE.search(message)
+        near = did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2])) if wrong else ""
+        self.exit(2, f"{self.prog}: {message}.{near} See {self.prog} --help.\n")
 
     def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
         """Print a help text or a mistake; a help text that cannot be written is an `OSError`, which argparse hides."""

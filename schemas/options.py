@@ -41,8 +41,12 @@ def number_range(text: str) -> list[int]:
     for part in text.strip().removesuffix(",").split(","):
         if matched := _RANGE.fullmatch(part.strip()):
             first, last = int(matched[1]), int(matched[2])
-            if last < first or len(numbers) + last - first >= _MOST_IN_RANGE:
+            if last < first:
                 raise argparse.ArgumentTypeError(f"'{text}' is no range; write the smaller number first, as 0-2")
+            if len(numbers) + last - first >= _MOST_IN_RANGE:
+                raise argparse.ArgumentTypeError(
+                    f"'{text}' is {last - first + 1:,} numbers; at most {_MOST_IN_RANGE:,}"
+                )
             numbers += range(first, last + 1)
             continue
         try:

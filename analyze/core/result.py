@@ -9,6 +9,8 @@ from typing import Literal, TypeAlias
 
 import polars as pl
 
+from vla_attention.schemas.errors import unknown_name
+
 #: What the values of a column are. prose: text of any length, in the last column. percent: a share, 0.5 is 50 %.
 #: factor: 1 is no change. signed: with its sign. points: a difference of shares, with its sign. p: a p-value or what it
 #: was adjusted to.
@@ -153,9 +155,9 @@ class Result:
         """The frame of the table with this name, all its rows.
 
         Raises:
-            KeyError: no table has it.
+            UnknownName: no table has it.
         """
         for table in self.tables:
             if table.name == name:
                 return table.frame.lazy().collect()
-        raise KeyError(f"no table '{name}'; there are {', '.join(table.name for table in self.tables)}")
+        raise unknown_name("table", name, [table.name for table in self.tables])
