@@ -208,6 +208,8 @@ def test_the_command_line_writes_files_and_refuses_what_shows_nothing(tmp_path, 
 def test_a_store_of_rollouts(tmp_path):
     answer = va.data(write_store(tmp_path / "run.zarr", episodes=5))
     assert answer["ways"].height == 2
+    with pytest.raises(UserError):
+        answer["wyas"]
     assert answer.findings[0].asks == MUST
     assert answer.findings[0].numbers["n"] == 10
     with pytest.raises(UserError):
