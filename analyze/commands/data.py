@@ -42,6 +42,8 @@ from vla_attention.schemas.safe_text import visible
 Numbers: TypeAlias = dict[str, float | int | str | None]
 #: From this share on, the picture tells the sentence.
 TELLS = 0.9
+#: A simpler look that is right in this much less does as well.
+_AS_WELL = 0.03
 #: Names in a sentence.
 _NAMES = 4
 _MUST, _WHERE, _WORDS, _BY_WHAT = "Must a policy read the sentence here?", "Where must it?", "Which words?", "By what?"
@@ -200,7 +202,7 @@ def _by_what(found: Told) -> list[Finding]:
     ]
     best_name, best = max(alone, key=lambda one: one[1].value)
     simple = sorted(alone, key=lambda one: (one[0].startswith("picture"), -one[1].value))
-    name, share = next(one for one in simple if one[1].value >= best.interval()[0])
+    name, share = next(one for one in simple if one[1].value >= best.value - _AS_WELL)
     said = f"The {name} alone tells it in {share.value:.0%} {_ends(share)}"
     numbers: Numbers = {"look": name, "told": share.value, "best": best_name}
     bright = [one for one in simple if one[0].startswith("brightness")]
