@@ -307,7 +307,8 @@ def _said_in_ways(ways: pl.DataFrame) -> Finding:
         said = f"No: {plural(ways.height, 'thing')} to do, each always said in the same words."
     else:
         top = several.sort("ways", descending=True).row(0, named=True)
-        said = f"Of {plural(ways.height, 'thing')} to do, {several.height} are said in more than one way; '"
+        verb = "is" if several.height == 1 else "are"
+        said = f"Of {plural(ways.height, 'thing')} to do, {several.height} {verb} said in more than one way; '"
         said += f"{top['sentence']}' in {top['ways']} (this one in {top['commonest']:.0%} of its episodes)."
     return Finding(said, _WAYS, numbers, limit)
 
