@@ -44,12 +44,11 @@ def question_parser(name: str) -> OneSentenceParser:
         parser.add_argument(
             "--num-episodes", type=int, metavar="N", help="read N episodes, evenly over all (default: 5000 at most)"
         )
-        add_output(parser, name)
-        return parser
     else:
         parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     parser.instead = INSTEAD | _of_other_questions(command)
-    add_question(parser, command.options)
+    if not command.data:
+        add_question(parser, command.options)
     add_output(parser, name, command.page)
     return parser
 

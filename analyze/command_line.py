@@ -14,6 +14,7 @@ from vla_attention.analyze.ask import question_parser, run_question
 from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.stores.store_url import is_store
 from vla_attention.schemas.threads import add_threads, use_threads
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
@@ -28,11 +29,6 @@ def run_command_line(given: Sequence[str], if_stopped: str, program: str = "vla-
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     name, rest = _command(given)
     return run_command(f"{program} {name}", lambda: _run(name, rest, program), if_stopped)
-
-
-def is_store(word: str) -> bool:
-    """Whether a word of a command line is the place of a store."""
-    return word.rstrip("/").endswith(".zarr") or "://" in word
 
 
 def _command(given: Sequence[str]) -> tuple[str, list[str]]:

@@ -65,9 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     if given[0] in ANALYSES:
         return _analyses(given)
-    from vla_attention.analyze.command_line import is_store
     from vla_attention.schemas.errors import did_you_mean, listing
     from vla_attention.schemas.safe_text import visible
+    from vla_attention.schemas.stores.store_url import is_store
 
     name, known = visible(given[0]), [*COMMANDS, *ANALYSES]
     if is_store(given[0]):

@@ -8,7 +8,7 @@ differ where the pictures do not; and in how many ways the same is said.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import combinations
 from typing import Any, TypeAlias
 
@@ -35,7 +35,7 @@ from vla_attention.analyze.core.shared_scenes import (
     words_by_picture,
 )
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
-from vla_attention.analyze.statistics.told_apart import SHUFFLES, Labels, Share, Told, enough, tell
+from vla_attention.analyze.statistics.told_apart import Labels, Share, Told, enough, tell
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.safe_text import visible
 
@@ -80,7 +80,7 @@ def data(episodes: DataEpisodes) -> Result:
     return Result(
         "Do the data ask for the sentence?",
         _about(episodes, len(set(told))),
-        [*findings, _said_in_ways(ways), *_faults(episodes)],
+        [*findings, _said_in_ways(ways, told), *_faults(episodes)],
         [*tables, Table("ways", ways, _WAY_COLUMNS, "What is said, and in how many ways")],
         figures,
         notes,
@@ -138,11 +138,6 @@ def _share(right: Any, scenes: int) -> Share:
     return Share.of(float(np.mean(right)), scenes)
 
 
-def _is_told(found: Told) -> bool:
-    """Whether the sentence is told more often than in any of the ways to shuffle them: of null data, in 1 %."""
-    return found.p * (SHUFFLES + 1) < 1.5
-
-
 def _must_read(found: Told, groups: Labels, sentences: Sentences, pairs: pl.DataFrame) -> Finding:
     share, n, number = _share(found.right, found.scenes), len(groups), len(sentences.keys)
     low, high = share.interval()
@@ -154,7 +149,7 @@ def _must_read(found: Told, groups: Labels, sentences: Sentences, pairs: pl.Data
     beside = f"(guessing: {guess:.0%}; shuffled sentences: at most {found.shuffled.max():.0%})"
     of = f"which of {number} sentences was given"
     advice, limit = "", _WEAK
-    if not _is_told(found):
+    if not found.is_shown:
         sentence = f"Perhaps: this look does not tell {of}: right in {share.value:.0%} of {n} episodes, in at most "
         sentence += f"{high:.0%} {beside}."
     elif low >= TELLS:
@@ -195,7 +190,7 @@ def _difference(one: str, other: str) -> int:
 
 def _by_what(found: Told) -> list[Finding]:
     """The simplest look that tells the sentence nearly as well as the best one: brightness, state, picture."""
-    if not _is_told(found):
+    if not found.is_shown:
         return []
     alone = [
         (name, _share(right, found.scenes)) for name, right in found.by_look.items() if not name.startswith(EVERYTHING)
@@ -296,10 +291,10 @@ def _demonstrations(parts: pl.DataFrame, episodes: DataEpisodes) -> list[Finding
     return [Finding(f"{said}{'; ' + rest if rest else ''}.", _ACTIONS, numbers)]
 
 
-def _said_in_ways(ways: pl.DataFrame) -> Finding:
+def _said_in_ways(ways: pl.DataFrame, told: Sequence[str]) -> Finding:
     sentences, several = int(ways["ways"].sum()), ways.filter(pl.col("ways") > 1)
-    vocabulary = {word for name in ways["sentence"] for word in name.lower().split()}
-    numbers: Numbers = {"sentences": sentences, "meanings": ways.height}
+    vocabulary = {word for sentence in told for word in sentence.split()}
+    numbers: Numbers = {"sentences": sentences, "meanings": ways.height, "words": len(vocabulary)}
     limit = (
         f"{plural(len(vocabulary), 'word')} in all. Counted by words with a meaning of their own: synonyms are others."
     )
@@ -346,7 +341,7 @@ def _matrix(pairs: pl.DataFrame, sentences: Sentences, episodes: DataEpisodes) -
         [(str(b + 1), names[a], told) for a, b, told in sorted(rows, key=lambda one: (-one[0], one[1]))],
         schema={"other": pl.String, "sentence": pl.String, "told": pl.Float64}, orient="row",
     )  # fmt: skip
-    beside = {names[place[number]]: episodes.pictures[sentences.keys[number]][0] for number in order}
+    beside = {names[place[number]]: episodes.pictures[sentences.keys[number]] for number in order}
     options = {"x": "other", "y": "sentence", "value": "told", "share": True, "low": 0.5, "label": "told apart",
                "xlabel": "and this one", "ylabel": "", "beside": beside}  # fmt: skip
     left = len(sentences.keys) - len(order)

@@ -24,7 +24,7 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.store_url import store_place
+from vla_attention.schemas.stores.store_url import is_store, store_place
 
 Picture: TypeAlias = NDArray[np.uint8]
 #: A look of the user's own: picture (height, width, 3) -> (number,).
@@ -54,7 +54,7 @@ class DataEpisodes:
         several: episodes in which more than one sentence is told; that of the first frame counts.
         cameras, state: what was looked at.
         looks: what the beginnings look like, by name.
-        pictures: sentence -> a first picture of each camera, small.
+        pictures: sentence -> a first picture of the first camera, small.
         motions: (moment, episode, number), what was done until then; None without actions and states.
         moments: (moment,) in `unit`.
         unit: "s", or "steps" of a simulator.
@@ -68,7 +68,7 @@ class DataEpisodes:
     cameras: tuple[str, ...]
     state: str
     looks: Mapping[str, Look]
-    pictures: Mapping[str, tuple[Picture, ...]]
+    pictures: Mapping[str, Picture]
     motions: Array | None
     moments: Array
     unit: str
@@ -103,7 +103,7 @@ def read_episodes(place: str | Path, num_episodes: int | None = None, encoder: E
     if num_episodes is not None and num_episodes < 1:
         raise BadArgument(f"--num-episodes is {num_episodes}; expected at least 1.")
     most = num_episodes or MOST_EPISODES
-    if _is_store(str(place)):
+    if is_store(str(place)) or (Path(place) / "zarr.json").is_file():
         store = open_store(store_place(str(place)))
         chosen = _spread(store.episodes, most)
         moments = _moments([one.attributes.num_steps for one in chosen])
@@ -121,10 +121,6 @@ def read_episodes(place: str | Path, num_episodes: int | None = None, encoder: E
 def _moments(lengths: Sequence[int]) -> Array:
     """Ends of sixteen parts of an episode of the median length."""
     return np.arange(1, MOMENTS + 1) / MOMENTS * (float(np.median(lengths)) if lengths else 0.0)
-
-
-def _is_store(place: str) -> bool:
-    return place.rstrip("/").endswith(".zarr") or "://" in place or (Path(place) / "zarr.json").is_file()
 
 
 def _spread(all_of_them: Sequence, most: int) -> list:  # type: ignore[type-arg]
@@ -185,7 +181,7 @@ def collected(
     written: dict[str, Counter[str]] = {}
     small: dict[str, list[Array]] = {}
     encoded: dict[str, list[Array]] = {}
-    shown: dict[str, tuple[Picture, ...]] = {}
+    shown: dict[str, Picture] = {}
     states, motions, several = [], [], 0
     with progress_bar(number, "episodes") as advance:
         for episode in episodes:
@@ -201,7 +197,7 @@ def collected(
                 if encoder is not None:
                     encoded.setdefault(camera, []).append(np.asarray(encoder(picture), dtype=np.float64).ravel())
             if sentence not in shown:
-                shown[sentence] = tuple(_resized(picture, _SHOWN) for picture in episode.images.values())
+                shown[sentence] = _resized(next(iter(episode.images.values())), _SHOWN)
             written.setdefault(sentence, Counter())[episode.instruction.strip()] += 1
             sentences.append(sentence)
             states.append(episode.state)

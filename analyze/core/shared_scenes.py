@@ -126,7 +126,8 @@ def words_by_pairs(pairs: pl.DataFrame, sentences: Sentences) -> pl.DataFrame:
 
 def words_by_picture(episodes: DataEpisodes) -> pl.DataFrame:
     """Of every word, whether the picture tells it from other words of its kind."""
-    by_kind = [words_by_kind(sentence) for sentence in episodes.sentences]
+    kinds = {sentence: words_by_kind(sentence) for sentence in set(episodes.sentences)}
+    by_kind = [kinds[sentence] for sentence in episodes.sentences]
     looks, rows = list(episodes.looks.values()), []
     words = [(kind, word) for kind in KINDS for word in sorted(set().union(*(one[kind] for one in by_kind)))]
     with progress_bar(len(words), "words") as advance:

@@ -79,6 +79,11 @@ class StoreUrl:
 StorePlace = Path | StoreUrl
 
 
+def is_store(word: str) -> bool:
+    """Whether a word of a command line is the place of a store."""
+    return word.rstrip("/").endswith(".zarr") or "://" in word
+
+
 def store_place(given: str | Path | StoreUrl) -> StorePlace:
     """The path or the address that somebody gave. `Path("s3://bucket/a.zarr")`, which lost a slash, is an address."""
     if isinstance(given, StoreUrl):

@@ -170,6 +170,7 @@ def test_faults_of_the_sentences():
     assert (faults.numbers["otherwise"], faults.numbers["several"], faults.numbers["empty"]) == (1, 1, 6)
     ways = {row["sentence"].casefold().rstrip("."): row["ways"] for row in answer["ways"].iter_rows(named=True)}
     assert ways == {"pick the red cup": 2, "push the blue cup": 1, "turn it": 1}  # "up" says nothing of its own
+    assert found["Is it said in more than one way?"].numbers["words"] == 9  # those of every way to say it
     assert {row["num_first"] for row in answer["pairs"].iter_rows(named=True)} >= {12}
 
 
