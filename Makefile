@@ -54,7 +54,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 .PHONY: libero-assets capture analyze test test-mujoco test-policies test-remote test-rerun test-policies-lerobot06 test-libero test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
-	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
+	$(BIN)/vla-attention capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
 	  $(CAPTURE_ARGS) $(if $(SEED),--seed $(SEED)) $(if $(TASK_ID),--task $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
 analyze: .venv/analyze-installed

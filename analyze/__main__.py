@@ -1,4 +1,4 @@
-"""`vla-analyze` and `parse-attention-ratio-results`: the command lines of stage two.
+"""The command lines of stage two: `vla-attention COMMAND STORE`, and the published `parse-attention-ratio-results`.
 
 What they need is imported inside of them, so that Ctrl-C is a sentence from the first moment on.
 """
@@ -15,24 +15,16 @@ from vla_attention.schemas.stop_signals import end_program, run_until_stopped
 IF_STOPPED = "nothing was left half written."
 
 
-def main(argv: Sequence[str] | None = None, program: str = "vla-analyze") -> int:
-    """Run the command line; returns the exit code (2: an argument or a store is wrong, and one sentence says how).
-
-    program: the name that it was called by: this, or vla-attention.
-    """
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code (2: an argument or a store is wrong, and one sentence says how)."""
     given = sys.argv[1:] if argv is None else list(argv)
 
     def run() -> int:
         from vla_attention.analyze.command_line import run_command_line
 
-        return run_command_line(given, IF_STOPPED, program)
+        return run_command_line(given, IF_STOPPED)
 
-    return run_until_stopped(program, run, IF_STOPPED)
-
-
-def program() -> NoReturn:
-    """The console script `vla-analyze`."""
-    end_program(main())
+    return run_until_stopped("vla-attention", run, IF_STOPPED)
 
 
 def parse_attention_ratio_results() -> NoReturn:
@@ -47,4 +39,4 @@ def parse_attention_ratio_results() -> NoReturn:
 
 
 if __name__ == "__main__":
-    program()
+    end_program(main())

@@ -1,4 +1,4 @@
-"""The Python API: an opened store whose methods are the commands of `vla-analyze` and return answers with their tables.
+"""The Python API: an opened store whose methods are the questions of `vla-attention` and return answers with tables.
 
 The examples run as tests, with `store` and `other` being paths of small stores, `with_effects` and `replayed` those of
 stores with recorded effects and of a replayed data set, and `folder` that of an empty folder.

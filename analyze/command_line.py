@@ -1,4 +1,4 @@
-"""Running one command of `vla-analyze`: which one it is, and what all of them share."""
+"""Running one command that reads stores: which one it is, and what all of them share."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 
 
-def run_command_line(given: Sequence[str], if_stopped: str, program: str = "vla-analyze") -> int:
+def run_command_line(given: Sequence[str], if_stopped: str) -> int:
     """Run the command that the arguments name; returns the exit code. if_stopped: what is said after a stop."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     name, rest = _command(given)
-    return run_command(f"{program} {name}", lambda: _run(name, rest, program), if_stopped)
+    return run_command(f"vla-attention {name}", lambda: _run(name, rest), if_stopped)
 
 
 def _command(given: Sequence[str]) -> tuple[str, list[str]]:
@@ -41,11 +41,11 @@ def _command(given: Sequence[str]) -> tuple[str, list[str]]:
     return DEFAULT_COMMAND, words
 
 
-def _run(name: str, arguments: Sequence[str], program: str) -> int:
+def _run(name: str, arguments: Sequence[str]) -> int:
     if name == DEFAULT_COMMAND:
         _refuse_misspelt_command(arguments)
     parser = build_parser(name)
-    parser.prog = f"{program} {name}"
+    parser.prog = f"vla-attention {name}"
     parsed = parser.parse_args(arguments)
     # The libraries read the numbers when they are imported, which the command does.
     use_threads(parsed.threads)

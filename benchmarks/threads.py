@@ -3,7 +3,7 @@
 Usage: python benchmarks/threads.py [--rounds 7] [--busy 2] [--threads N]
 
 Three processes make the untrained pi0.5's calls in turn, so that all of them see the same machine: with torch's own
-defaults, with the number of threads and the sleeping that `vla-capture` sets, and with one thread. Two more scan a
+defaults, with the number of threads and the sleeping that `capture` sets, and with one thread. Two more scan a
 store of ten episodes through the Python API: with numpy's default threads, and with one BLAS thread inside the scan, as
 the product does. Medians are printed; on a machine with other work, "alone" is not alone.
 """
@@ -116,7 +116,7 @@ def main() -> None:
         make_store(store, episodes=10, replans=20)
         cases = {
             "policy call, torch's defaults": ["policy", "default"],
-            "policy call, as vla-capture": ["policy", arguments.threads],
+            "policy call, as vla-attention capture": ["policy", arguments.threads],
             "policy call, one thread": ["policy", "1"],
             "scan, numpy's defaults": ["scan", "default", str(store)],
             "scan, as in the Python API": ["scan", "", str(store)],

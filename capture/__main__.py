@@ -1,4 +1,4 @@
-"""`vla-capture` and the published scripts' commands: the command lines of stage one.
+"""The command lines of stage one: `vla-attention capture ...`, and the published scripts' commands.
 
 What they need is imported inside of them, so that Ctrl-C is a sentence from the first moment on.
 """
@@ -14,6 +14,7 @@ from vla_attention.schemas.stop_signals import end_program, run_until_stopped
 if TYPE_CHECKING:
     import argparse
 
+_PROGRAM = "vla-attention capture"
 #: What is said after Ctrl-C.
 IF_STOPPED = "complete episodes are kept, continue with --resume."
 #: Commands that record nothing, and what is said of them.
@@ -21,34 +22,26 @@ _RECORD_NOTHING = ("doctor", "status", "tasks", "verify")
 _IF_LOOKING = "nothing was left half written."
 
 
-def main(argv: Sequence[str] | None = None, program: str = "vla-capture") -> int:
-    """Run the command line; returns the exit code, which is 2 after a mistake in the arguments.
-
-    program: the name that it was called by.
-    """
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code, which is 2 after a mistake in the arguments."""
     given = sys.argv[1:] if argv is None else list(argv)
     if_stopped = _IF_LOOKING if given and given[0] in _RECORD_NOTHING else IF_STOPPED
 
     def run() -> int:
         from vla_attention.capture.commands.command_line import run_capture_command
 
-        return run_capture_command(program, lambda: _parse(given, program), if_stopped)
+        return run_capture_command(_PROGRAM, lambda: _parse(given), if_stopped)
 
-    return run_until_stopped(program, run, if_stopped)
+    return run_until_stopped(_PROGRAM, run, if_stopped)
 
 
-def _parse(given: Sequence[str], program: str) -> argparse.Namespace:
+def _parse(given: Sequence[str]) -> argparse.Namespace:
     from vla_attention.capture.commands.arguments import build_parser
     from vla_attention.capture.commands.mistakes import refuse_other_tools_words
 
     refuse_other_tools_words(given)
-    parsed: argparse.Namespace = build_parser(given, program).parse_args(given)
+    parsed: argparse.Namespace = build_parser(given).parse_args(given)
     return parsed
-
-
-def program() -> NoReturn:
-    """The console script `vla-capture`."""
-    end_program(main())
 
 
 def evaluate_attention_ratio() -> NoReturn:
@@ -71,4 +64,4 @@ def _end_published(name: str) -> NoReturn:
 
 
 if __name__ == "__main__":
-    program()
+    end_program(main())

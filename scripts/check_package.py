@@ -254,9 +254,9 @@ def capture_and_analyse(laptop: Path, node: Path, folder: Path) -> None:
     run(node / "python", "-m", f"{PACKAGE}.capture", "pi", *short, "--output", store, cwd=folder, quiet=True)
     code = json.loads((store / "zarr.json").read_text())["attributes"]["provenance"]["code"]
     check(code == version(), f"the store was made by code version {code}, expected {version()}")
-    run(laptop / "vla-analyze", store, "--output", output, cwd=folder, quiet=True)
+    run(laptop / "vla-attention", "analyze", store, "--output", output, cwd=folder, quiet=True)
     run(laptop / "python", "-m", f"{PACKAGE}.analyze", "store", "verify", store, cwd=folder, quiet=True)
-    run(laptop / "vla-analyze", "report", store, "--output", output / "report.html", cwd=folder, quiet=True)
+    run(laptop / "vla-attention", "report", store, "--output", output / "report.html", cwd=folder, quiet=True)
     written = sorted(path.suffix for path in output.rglob("*") if path.is_file())
     check({".json", ".parquet", ".png", ".html"} <= set(written), f"the analysis wrote only {written}")
     results = sorted(output.rglob("attention_ratio_results*.json"))

@@ -18,11 +18,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PROGRAMS = {
-    "vla-analyze": "vla_attention.analyze",
-    "vla-capture": "vla_attention.capture",
-    "vla-attention": "vla_attention",
-}
 _SAMPLE = re.compile(
     r"^<!-- sample: (?P<commands>[^\n]+?)(?: :: (?P<lines>[\d -]+))? -->\n\n?```(?P<language>\w*)\n(?P<text>.*?)^```",
     re.M | re.S,
@@ -50,8 +45,8 @@ def main() -> int:
 def _again(found: re.Match[str]) -> str:
     output = ""
     for command in found["commands"].split(" && "):
-        program, *words = shlex.split(command)
-        call = [sys.executable, "-m", PROGRAMS[program], *words]
+        _, *words = shlex.split(command)  # vla-attention
+        call = [sys.executable, "-m", "vla_attention", *words]
         output = subprocess.run(call, check=True, text=True, stdout=subprocess.PIPE, cwd=ROOT).stdout
     text = "\n".join(chosen(output.rstrip("\n").split("\n"), found["lines"]))
     return f"{found[0][: found.start('text') - found.start()]}{text}\n```"

@@ -58,80 +58,80 @@ QUESTIONS = {
 
 
 def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """Names and words of all calls, in the order in which they are made; each may read what an earlier one wrote."""
+    """Names and words of all calls, in the order in which they are made; some read what an earlier one wrote."""
     cubes = "stores/cubes.zarr"
-    yield "capture_cubes", ["vla-capture", "pi", *TWO_TASKS, "--output", cubes]
-    yield "capture_resume", ["vla-capture", "pi", *TWO_TASKS, "--output", cubes, "--resume"]
-    yield "capture_exists", ["vla-capture", "pi", *TWO_TASKS, "--output", cubes]
+    yield "capture_cubes", ["capture", "pi", *TWO_TASKS, "--output", cubes]
+    yield "capture_resume", ["capture", "pi", *TWO_TASKS, "--output", cubes, "--resume"]
+    yield "capture_exists", ["capture", "pi", *TWO_TASKS, "--output", cubes]
     yield "capture_two_simulators", [
-        "vla-capture", "pi", *TWO_TASKS[:-4], "--num-envs", "2", "--policy-batch", "1", "--threads", "1",
+        "capture", "pi", *TWO_TASKS[:-4], "--num-envs", "2", "--policy-batch", "1", "--threads", "1",
         "--output", "stores/two.zarr",
     ]  # fmt: skip
-    yield "capture_task", ["vla-capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--output", "stores/task.zarr"]
+    yield "capture_task", ["capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--output", "stores/task.zarr"]
     yield "capture_cosmos", [
-        "vla-capture", "cosmos", "--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps",
+        "capture", "cosmos", "--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps",
         "6", "--threads", "1", "--num-envs", "1", "--output", "stores/cosmos.zarr",
     ]  # fmt: skip
     yield "capture_knockout", [
-        "vla-capture", "pi", *TWO_TASKS, "--knockout", "word:cube", "--prompt", "text:touch the blue cube",
+        "capture", "pi", *TWO_TASKS, "--knockout", "word:cube", "--prompt", "text:touch the blue cube",
         "--output", "stores/changed.zarr",
     ]  # fmt: skip
     if os.environ.get("VLA_LIBERO_ASSETS"):
         yield "capture_libero", [
-            "vla-capture", "pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_spatial", "--task-id", "0",
+            "capture", "pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_spatial", "--task-id", "0",
             "--num-episodes", "1", "--max-steps", "10", "--threads", "1", "--num-envs", "1",
             "--output", "stores/libero.zarr",
         ]  # fmt: skip
-    rerun = ["vla-capture", "rerun", cubes, "--check", "1", "--threads", "1"]
+    rerun = ["capture", "rerun", cubes, "--check", "1", "--threads", "1"]
     yield "rerun", [*rerun, "--noise-seed", "3", "--output", "stores/noise.zarr"]
     yield "rerun_knockout", [*rerun, "--knockout", "role:instruction", "--output", "stores/unread.zarr"]
     yield "rerun_groups", [*rerun, "--effects", "text,grouping:default", "--output", "stores/groups.zarr"]
-    replay = ["vla-capture", "replay", "data", "--checkpoint", "untrained-tiny", "--threads", "1", "--every", "3"]
+    replay = ["capture", "replay", "data", "--checkpoint", "untrained-tiny", "--threads", "1", "--every", "3"]
     replay += ["--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=none"]
     yield "replay", [*replay, "--output", "stores/replay.zarr"]
-    yield "status", ["vla-capture", "status", cubes]
-    yield "status_json", ["vla-capture", "status", cubes, "--json"]
-    yield "tasks", ["vla-capture", "tasks", "cubes"]
-    yield "capture_verify", ["vla-capture", "verify", cubes]
-    yield "capture_repair", ["vla-capture", "verify", cubes, "--repair", "--quick"]
-    yield "doctor", ["vla-capture", "doctor", "--output", cubes, "--threads", "1"]
+    yield "status", ["capture", "status", cubes]
+    yield "status_json", ["capture", "status", cubes, "--json"]
+    yield "tasks", ["capture", "tasks", "cubes"]
+    yield "capture_verify", ["capture", "verify", cubes]
+    yield "capture_repair", ["capture", "verify", cubes, "--repair", "--quick"]
+    yield "doctor", ["capture", "doctor", "--output", cubes, "--threads", "1"]
     for place in _stores(folder):
         kind = place.removeprefix("stores/").replace("/", "_").removesuffix(".zarr")
         for name, words in QUESTIONS.items():
             output = [] if name == "verify" else ["--output", f"results/{kind}_{name}"]
             before = list(takewhile(lambda word: not word.startswith("--"), words))
-            yield f"{kind}_{name}", ["vla-analyze", *before, place, *words[len(before) :], *output]
+            yield f"{kind}_{name}", [*(before or ["analyze"]), place, *words[len(before) :], *output]
     example = "stores/example"
     base = f"{example}/cubes.zarr"
-    yield "compare", ["vla-analyze", "compare", base, f"{example}/cubes_one_colour.zarr", "--output", "results/compare"]
-    yield "effects", ["vla-analyze", "effects", base, "--output", "results/effects"]
-    yield "report_effects", ["vla-analyze", "report", base, "--output", "results/report_effects"]
-    yield "effects_of_data", ["vla-analyze", "effects", "stores/replay.zarr", "--output", "results/effects_of_data"]
+    yield "compare", ["compare", base, f"{example}/cubes_one_colour.zarr", "--output", "results/compare"]
+    yield "effects", ["effects", base, "--output", "results/effects"]
+    yield "report_effects", ["report", base, "--output", "results/report_effects"]
+    yield "effects_of_data", ["effects", "stores/replay.zarr", "--output", "results/effects_of_data"]
     yield "own_groups", [
-        "vla-analyze", base, "--group", "colour=word:red,word:green,word:blue", "--group", "seen=role:image", "--ratio",
+        "analyze", base, "--group", "colour=word:red,word:green,word:blue", "--group", "seen=role:image", "--ratio",
         "seen/colour", "--output", "results/own_groups",
     ]  # fmt: skip
-    yield "copy", ["vla-attention", "store", "copy", base, "stores/copied.zarr", "--without", "frames"]
-    yield "tar", ["vla-attention", "store", "copy", cubes, "stores/tars.zarr", "--tar"]
-    yield "unpack", ["vla-attention", "store", "copy", "stores/tars.zarr", "stores/unpacked.zarr"]
+    yield "copy", ["store", "copy", base, "stores/copied.zarr", "--without", "frames"]
+    yield "tar", ["store", "copy", cubes, "stores/tars.zarr", "--tar"]
+    yield "unpack", ["store", "copy", "stores/tars.zarr", "stores/unpacked.zarr"]
     yield (
         "merge",
-        ["vla-attention", "store", "copy", "stores/unpacked.zarr", "stores/task.zarr", "-o", "stores/merged.zarr"],
+        ["store", "copy", "stores/unpacked.zarr", "stores/task.zarr", "-o", "stores/merged.zarr"],
     )
-    yield "merge_refused", ["vla-attention", "store", "copy", cubes, "stores/two.zarr", "-o", "stores/refused.zarr"]
+    yield "merge_refused", ["store", "copy", cubes, "stores/two.zarr", "-o", "stores/refused.zarr"]
     for name, words in {
-        "no_store": ("nowhere.zarr",),
-        "unknown_group": (base, "--group", "a=word:zebra"),
-        "unknown_layer": (base, "--layers", "77"),
+        "no_store": ("analyze", "nowhere.zarr"),
+        "unknown_group": ("analyze", base, "--group", "a=word:zebra"),
+        "unknown_layer": ("analyze", base, "--layers", "77"),
         "unknown_command": ("rations", base),
     }.items():
-        yield name, ["vla-analyze", *words]
-    for program in ("vla-capture", "vla-analyze"):
-        yield f"{program}_help", [program, "--help"]
+        yield name, list(words)
+    yield "help", ["--help"]
+    yield "capture_help", ["capture", "--help"]
     for name in _commands_of("analyze"):
-        yield f"analyze_{name}_help", ["vla-analyze", name, "--help"]
+        yield f"analyze_{name}_help", [name, "--help"]
     for name in ("pi", "cosmos", "rerun", "replay", "status", "doctor", "tasks", "verify"):
-        yield f"capture_{name}_help", ["vla-capture", name, "--help"]
+        yield f"capture_{name}_help", ["capture", name, "--help"]
 
 
 def _commands_of(stage: str) -> list[str]:
@@ -161,15 +161,15 @@ def make(folder: Path, only: str) -> int:
         "OMP_NUM_THREADS": "1", "VLA_CACHE": "off", "SOURCE_DATE_EPOCH": "0", "COLUMNS": "120", "NO_COLOR": "1",
         "MPLBACKEND": "agg", "PYTHONHASHSEED": "0",
     }  # fmt: skip
-    modules = {program: f"vla_attention.{program[4:]}" for program in ("vla-capture", "vla-analyze")}
-    modules["vla-attention"] = "vla_attention"
     (folder / "said").mkdir()
-    for name, (program, *words) in commands(folder):
+    for name, words in commands(folder):
         if only not in name:
             continue
-        call = [sys.executable, "-m", modules[program], *words]
+        call = [sys.executable, "-m", "vla_attention", *words]
         done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-        said = f"$ {program} {' '.join(words)}\n{done.stdout}\n--- stderr\n{done.stderr}\n--- exit {done.returncode}\n"
+        said = (
+            f"$ vla-attention {' '.join(words)}\n{done.stdout}\n--- stderr\n{done.stderr}\n--- exit {done.returncode}\n"
+        )
         (folder / "said" / f"{name}.txt").write_text(said)
         print(f"{done.returncode} {name}", flush=True)
     return 0

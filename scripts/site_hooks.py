@@ -121,8 +121,7 @@ def help_texts() -> str:
 
 def _commands() -> Iterator[tuple[str, str]]:
     """Every (program, command or "") that has a help text."""
-    yield "vla-attention", ""
-    for program in ("vla-analyze", "vla-capture"):
+    for program in MODULES:
         yield program, ""
         yield from ((program, command) for command in commands_of(program))
     yield from ((program, "") for program in PUBLISHED)
@@ -131,8 +130,7 @@ def _commands() -> Iterator[tuple[str, str]]:
 #: Our programs -> their modules.
 MODULES = {
     "vla-attention": "vla_attention",
-    "vla-analyze": "vla_attention.analyze",
-    "vla-capture": "vla_attention.capture",
+    "vla-attention capture": "vla_attention.capture",
 }
 #: The published scripts' names -> the module and the function of this program.
 PUBLISHED = {
@@ -143,9 +141,9 @@ PUBLISHED = {
 
 
 def commands_of(program: str) -> list[str]:
-    """The commands that the program's own help lists; those of `vla-analyze` are in the help of all."""
-    questions = program == "vla-analyze"
-    text = printed_help("vla-attention" if questions else program, "")
+    """The commands that the program's own help lists."""
+    questions = program == "vla-attention"
+    text = printed_help(program, "")
     begin, end, width = (
         ("\nquestions to a store", "\n  help,", 2) if questions else ("positional arguments:", "\noptions:", 4)
     )

@@ -34,16 +34,16 @@ done
 [ -z "${STAGE:-}" ] || die "STAGE is '$STAGE'; this script sets it itself."
 
 if [ -z "$array" ]; then
-  capture=vla-capture
+  program=vla-attention
   if [ -n "${SETUP:-}" ]; then
     set +eu
     eval "$SETUP"
     set -eu
   fi
-  command -v "$capture" >/dev/null || capture=.venv/bin/vla-capture
-  command -v "$capture" >/dev/null ||
-    die "vla-capture is neither on PATH nor in $PWD/.venv/bin; activate an environment in SETUP, or give --array=0-9."
-  array=--array=$("$capture" tasks "${TASK_SUITE:-libero_10}" --array) || exit 2
+  command -v "$program" >/dev/null || program=.venv/bin/vla-attention
+  command -v "$program" >/dev/null ||
+    die "vla-attention is neither on PATH nor in $PWD/.venv/bin; activate an environment in SETUP, or give --array=0-9."
+  array=--array=$("$program" capture tasks "${TASK_SUITE:-libero_10}" --array) || exit 2
 fi
 
 captures=(env STAGE=capture sbatch --parsable "$array" "${options[@]}" "$folder/$script")

@@ -18,10 +18,9 @@ import yaml
 from scripts.site_hooks import OUTSIDE
 from tests.kit.archives import unpacked
 from tests.kit.golden_tables import STORES
-from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
 from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.command_line import build_parser as build_analyze_parser
-from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
+from vla_attention.analyze.registry import COMMANDS
 from vla_attention.capture.commands.arguments import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -87,7 +86,7 @@ def command_lines(document: Path) -> Iterator[list[str]]:
     for block in re.findall(r"^```(?:bash|sh)\n(.*?)^```", text_of(document), re.DOTALL | re.MULTILINE):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
-            if words[:1] not in (["vla-analyze"], ["vla-capture"], ["vla-attention"]) or "rerun" in words[1:3]:
+            if words[:1] != ["vla-attention"] or "rerun" in words[1:3]:
                 continue
             if not any("$" in word or word == "..." for word in words):
                 yield words
@@ -95,18 +94,10 @@ def command_lines(document: Path) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
 def test_the_parsers_take_every_command_line(document):
-    for program, *given in command_lines(document):
-        if program == "vla-attention" and given[0] in PROGRAM_COMMANDS and given[0] not in ("analyze", "capture"):
-            continue  # example
-        if program == "vla-attention" and given[0] in ("analyze", "capture"):
-            program, *given = f"vla-{given[0]}", *given[1:]
-        if program == "vla-capture":
-            parser = build_parser(given)
-        else:
-            name = given[0] if given[0] in COMMANDS else DEFAULT_COMMAND
-            given = given[given[0] in COMMANDS :]
-            parser = build_analyze_parser(name)
-        parser.parse_args(given)  # a mistake ends it with a sentence and 2
+    for _, command, *given in command_lines(document):
+        if command != "example":
+            parser = build_parser(given) if command == "capture" else build_analyze_parser(command)
+            parser.parse_args(given)  # a mistake ends it with a sentence and 2
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -1,7 +1,6 @@
 """`vla-attention`: one name for every command of the package, so that `uvx vla-attention ...` reaches all of them.
 
-`vla-attention analyze STORE` and `vla-attention words STORE` are `vla-analyze STORE` and `vla-analyze words STORE`, and
-`vla-attention capture ...` is `vla-capture ...`. What they need is imported when they are called.
+What they need is imported when they are called.
 """
 
 from __future__ import annotations
@@ -35,11 +34,9 @@ vla-attention COMMAND --help says more, --help-all everything. From Python: impo
 def usage() -> str:
     """The help text."""
     from vla_attention.analyze.registry import COMMANDS as ANALYSES
-    from vla_attention.analyze.registry import DEFAULT_COMMAND
 
-    named = {"analyze" if name == DEFAULT_COMMAND else name: command for name, command in ANALYSES.items()}
-    questions = {name: command.answers for name, command in named.items() if not command.keeps}
-    keeping = {name: command.answers for name, command in named.items() if command.keeps}
+    questions = {name: command.answers for name, command in ANALYSES.items() if not command.keeps}
+    keeping = {name: command.answers for name, command in ANALYSES.items() if command.keeps}
     return _USAGE.format(questions=_lines(questions), keeping=_lines(keeping))
 
 
@@ -83,13 +80,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _analyses(given: Sequence[str]) -> int:
     from vla_attention.analyze.__main__ import main as analyze
 
-    return analyze(given, "vla-attention")
+    return analyze(given)
 
 
 def _capture(given: Sequence[str]) -> int:
     from vla_attention.capture.__main__ import main as capture
 
-    return capture(given, "vla-attention capture")
+    return capture(given)
 
 
 def _example(given: Sequence[str]) -> int:
@@ -98,10 +95,10 @@ def _example(given: Sequence[str]) -> int:
     return example(given)
 
 
-#: Command -> what runs it; besides these, the commands of `vla-analyze`.
+#: Command -> what runs it; besides these, the commands that read stores.
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "example": _example,
-    "analyze": _analyses,
+    "analyze": _analyses,  # `analyze words STORE` is `words STORE`
     "capture": _capture,
 }
 

@@ -9,7 +9,7 @@
         frame.values["observation.state"]            # (number,) float64
         frame.instruction, frame.seconds, frame.index
 
-`vla-capture replay` records policy calls on such frames; `ReplayPolicy` is what its `--policy FILE.py` returns.
+`capture replay` records policy calls on such frames; `ReplayPolicy` is what its `--policy FILE.py` returns.
 docs/my-data-set.md describes both.
 """
 

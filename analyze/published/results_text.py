@@ -36,7 +36,7 @@ _VERDICTS = {
 _CAVEAT = (
     "The file does not say how many keys are on each side, so there is no uniform baseline here. With hundreds of "
     "image keys and a dozen words, uniform attention alone gives ratios of 35 to 50: the verdict (above "
-    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. vla-analyze prints it "
+    f"{VISUAL_ABOVE} visual, below {LINGUISTIC_BELOW} linguistic) means little without it. `analyze` prints it "
     "beside every ratio."
 )
 _FRAMES_CAVEAT = (
@@ -172,7 +172,7 @@ def _baseline(rows: pl.DataFrame, found: dict[str, Any]) -> list[str]:
     return wrapped(
         [
             f"Uniform attention: {format_number(uniform)} ({keys}), which the guide calls {same}. Mean of ratio / "
-            f"uniform: {format_number(lift)} (arithmetic, as the mean above; the lift of vla-analyze is a geometric "
+            f"uniform: {format_number(lift)} (arithmetic, as the mean above; the lift of `analyze` is a geometric "
             "mean)."
         ],
         "    ",

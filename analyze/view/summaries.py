@@ -1,6 +1,6 @@
 """What Python's analysis says of each episode of a store, computed in a process of its own while pages are served.
 
-The numbers are those of `vla-analyze STORE`: the default grouping, all layers and heads, and what the cache of masses
+The numbers are those of `analyze STORE`: the default grouping, all layers and heads, and what the cache of masses
 has is not measured again.
 """
 

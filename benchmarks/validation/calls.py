@@ -1,6 +1,6 @@
 """Stored policy calls made again under many interventions, without writing stores: actions only.
 
-The calls are those of `vla-capture rerun`; a test compares them. Policies of different scales stand side by side here,
+The calls are those of `capture rerun`; a test compares them. Policies of different scales stand side by side here,
 so effects are in standard deviations of each run's own actions, which `vla-attention effects` takes last.
 """
 

@@ -1,4 +1,4 @@
-"""The command-line arguments of `vla-capture` and of the published scripts' commands."""
+"""The command-line arguments of `vla-attention capture` and of the published scripts' commands."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ _DOCTOR_EXAMPLES = """\
 """
 
 
-def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> argparse.ArgumentParser:
-    """Return the parser of `vla-capture`. In parsed arguments, `command` is the function to call.
+def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Return the parser of `vla-attention capture`. In parsed arguments, `command` is the function to call.
 
     given: what will be parsed; `rerun` takes the model options of the family whose store is among it.
     """
     families = policy_families()
     examples = "".join(family.examples for family in families)
     parser = OneSentenceParser(
-        prog=program,
+        prog="vla-attention capture",
         description="Run a policy in simulation and record the attention rows of its action queries.",
         epilog=f"examples:\n{examples}{_FURTHER_EXAMPLES}",
     )

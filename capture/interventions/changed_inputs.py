@@ -127,7 +127,7 @@ def object_patches(change: ImageChange, context: CallContext, *, known: bool = F
     if change.camera not in context.coverage:
         raise BadArgument(
             f"Cannot find the patches of '{change.object}' in camera '{change.camera}': there is no object coverage of "
-            "it; use a store as vla-capture wrote it, not a copy without objects."
+            "it; use a store as vla-attention capture wrote it, not a copy without objects."
         )
     covered, names = context.coverage[change.camera], [thing.name for thing in context.objects]
     if change.object not in names and known:

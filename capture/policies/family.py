@@ -97,7 +97,7 @@ class PublishedScript:
 class PolicyFamily:
     """One policy family on the command line."""
 
-    #: the command, as in `vla-capture NAME`
+    #: the command, as in `vla-attention capture NAME`
     name: str
     #: the family in a list and in messages
     title: str

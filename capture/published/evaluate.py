@@ -1,6 +1,6 @@
 """The published scripts' commands, `evaluate-attention-ratio` and its `-cosmos` form: capture, then analysis.
 
-Each is `vla-capture FAMILY` with the published defaults, and differs in three ways. `--layers` are the layers to
+Each is `capture FAMILY` with the published defaults, and differs in three ways. `--layers` are the layers to
 *analyse*: all layers are recorded, so that an analysis of others needs no second capture. An existing store is
 continued. One command may run several suites, or one task of an array job.
 """

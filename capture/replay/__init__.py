@@ -1,1 +1,1 @@
-"""Policy calls on recorded data sets of robots, without a simulator: `vla-capture replay`, and the readers."""
+"""Policy calls on recorded data sets of robots, without a simulator: `capture replay`, and the readers."""

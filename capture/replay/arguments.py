@@ -1,4 +1,4 @@
-"""The arguments of `vla-capture replay`. The model's options are those of the family that `--policy` names."""
+"""The arguments of `capture replay`. The model's options are those of the family that `--policy` names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ REPLAY_EXAMPLES = """\
   vla-attention capture replay lerobot/droid_100 --checkpoint gs://openpi-assets/checkpoints/pi05_droid \\
       --action action.joint_velocity action.gripper_position
   vla-attention capture replay data/so101_pick --policy my_smolvla.py --every 15
-  vla-capture replay data/bimanual --checkpoint my/pi0 --camera left_wrist_0_rgb=wrist --camera right_wrist_0_rgb=none
+  vla-attention capture replay data/bimanual --checkpoint my/pi0 --camera left_wrist_0_rgb=wrist \\
+      --camera right_wrist_0_rgb=none
 """
 
 

@@ -1,4 +1,4 @@
-"""The arguments of `vla-capture rerun`. The model's options are those of the family whose policy the store has."""
+"""The arguments of `capture rerun`. The model's options are those of the family whose policy the store has."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _family_of(root: RootAttributes) -> PolicyFamily:
         return family_of_kind(root.policy.family)
     except UnknownName:
         raise BadArgument(
-            f"Cannot rerun a store of '{root.policy.family}', a policy of the caller's own code, which vla-capture "
+            f"Cannot rerun a store of '{root.policy.family}', a policy of the caller's own code, which vla-attention "
             "cannot load; use vla-attention capture replay DATASET --policy FILE.py --knockout SELECTOR --rerun-of "
             "STORE, or va.record(..., interventions=va.knockout(SELECTOR)) (docs/my-policy.md)."
         ) from None

@@ -1,4 +1,4 @@
-"""`vla-capture rerun`: check that stored policy calls come out as they did, and make them again into stores."""
+"""`capture rerun`: check that stored policy calls come out as they did, and make them again into stores."""
 
 from __future__ import annotations
 

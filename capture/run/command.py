@@ -1,4 +1,4 @@
-"""`vla-capture FAMILY`: record a policy into a store, and analyse the store on request."""
+"""`vla-attention capture FAMILY`: record a policy into a store, and analyse the store on request."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def run_capture_of_family(arguments: argparse.Namespace, termination: Termination) -> int:
-    """Run `vla-capture FAMILY` on parsed arguments; returns the exit code."""
+    """Run `vla-attention capture FAMILY` on parsed arguments; returns the exit code."""
     threads = use_threads(arguments.threads)
 
     from vla_attention.capture.run.run_settings import run_settings
@@ -66,11 +66,11 @@ def load_policy(arguments: argparse.Namespace, runs: Sequence[RunSettings], thre
 
 
 def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None, more: Sequence[str] = ()) -> int:
-    """Analyse a store with the default arguments of its policy family; returns the exit code of `vla-analyze`.
+    """Analyse a store with the default arguments of its policy family; returns the exit code of `analyze`.
 
     It is a process of its own: the two stages share a store, not code.
 
-    arguments: the parsed command line of the capture. more: further arguments for `vla-analyze`.
+    arguments: the parsed command line of the capture. more: further arguments for `analyze`.
     """
     family: PolicyFamily = arguments.family
     command = [sys.executable, "-m", "vla_attention.analyze", str(store)]

@@ -1,4 +1,4 @@
-"""The scene of one task, the sentence of another: which rollouts `vla-capture exchange` makes."""
+"""The scene of one task, the sentence of another: which rollouts `vla-attention capture exchange` makes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """`export`: write a training's averaged weights as a checkpoint folder: openpi's PyTorch format, rounded to bfloat16.
 
-The folder holds the tokenizer and states its own sizes: `vla-capture pi --checkpoint FOLDER` needs nothing else.
+The folder holds the tokenizer and states its own sizes: `capture pi --checkpoint FOLDER` needs nothing else.
 """
 
 from __future__ import annotations

@@ -179,7 +179,7 @@ class Recording(Document, frozen=True):
 
 #: Names of protocols of runs whose loop is not ours: the caller's own, and a replayed data set.
 OTHER_LOOPS = ("recorded", "dataset")
-#: What the checkpoint format says of policies that the caller's own code loaded, and vla-capture cannot load.
+#: What the checkpoint format says of policies that the caller's own code loaded, and vla-attention capture cannot load.
 CALLERS_MODULES = "torch modules of the caller"
 
 

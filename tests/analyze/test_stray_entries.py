@@ -78,7 +78,7 @@ def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys,
     said = capsys.readouterr().err
     for path in {word for word in given if word in words.values()}:
         (line,) = [line for line in said.splitlines() if f" {path}, " in line]
-        assert line.startswith(f"vla-analyze {name}: ")
+        assert line.startswith(f"vla-attention {name}: ")
         assert NAMED in line
         # What view writes is for others, who do not need to know where the store was.
         said_in = ("result.json",) if command == "view" else ("result.json", "*.html")

@@ -42,7 +42,7 @@ def _drawing_is_not_asked() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def run_capture() -> Callable[..., None]:
-    """Run `vla-capture pi` with the tiny policy and further arguments; anything but success fails the test."""
+    """Run `capture pi` with the tiny policy and further arguments; anything but success fails the test."""
 
     def run(*arguments: object) -> None:
         with drawing_is_not_asked():

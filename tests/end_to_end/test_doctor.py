@@ -55,4 +55,4 @@ def test_the_policy_that_comes_along_lacks_nothing(tmp_path, capfd):
 
 def test_mistakes_are_named_in_one_line(capfd):
     assert capture(["doctor", "--num-episodes", "0"]) == 2
-    assert re.fullmatch("vla-capture: .*--num-episodes 0; .* 1.*\n", capfd.readouterr().err)
+    assert re.fullmatch("vla-attention capture: .*--num-episodes 0; .* 1.*\n", capfd.readouterr().err)

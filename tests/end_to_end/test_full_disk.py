@@ -97,7 +97,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_part_of_a_file(stores, tmp_pa
         assert code == 2 or all(len(content) <= limit for content in whole[name].values()), (name, code, said)
         assert code in (0, 2), (name, code, said)
         if too_large:
-            assert said.startswith(f"vla-analyze {WRITING[name][0]}: "), (name, said)
+            assert said.startswith(f"vla-attention {WRITING[name][0]}: "), (name, said)
             assert said.endswith("\n"), name
             assert said.count("\n") == 1, (name, said)
             assert "File too large" in said or "No usable temporary directory" in said, (name, said)

@@ -15,13 +15,11 @@ import pytest
 
 from tests.kit.lerobot_data_sets import H264, made_up_episodes, write_data_set
 from vla_attention.__main__ import main as every_command
-from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted((DOCS.parent / "examples").glob("*.ipynb"))
-PROGRAMS = {"vla-capture": capture, "vla-analyze": analyze, "vla-attention": every_command}
-#: Questions of `vla-analyze` that draw plots beside their text; a store in their place is the first one.
+#: Questions that draw plots beside their text.
 PLOTTED = ("analyze", "words", "objects", "effects", "compare")
 
 
@@ -41,13 +39,10 @@ def run_blocks(text: str, page: str) -> int:
         else:
             for line in block.replace("\\\n", " ").splitlines():
                 program, *arguments = shlex.split(line, comments=True)
-                if (
-                    program == "vla-analyze"
-                    and arguments[0].endswith((".zarr", *PLOTTED))
-                    and "--list" not in arguments
-                ):
+                assert program == "vla-attention"
+                if arguments[0] in PLOTTED and "--list" not in arguments:
                     arguments.append("--no-plots")
-                assert PROGRAMS[program](arguments) == 0, line
+                assert every_command(arguments) == 0, line
                 commands += 1
     return commands
 

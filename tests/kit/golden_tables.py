@@ -210,8 +210,8 @@ def parsed(words: list[str]) -> argparse.Namespace:
         ["make", "--dry-run", *given], cwd=ROOT, env=outside, capture_output=True, text=True, check=True, timeout=60
     )
     printed = made.stdout.replace("\\\n", " ").splitlines()
-    (line,) = [line for line in printed if "vla-capture" in line and "--task-suite" in line]
-    _, *given = shlex.split(line)
+    (line,) = [line for line in printed if "vla-attention capture" in line and "--task-suite" in line]
+    _, _, *given = shlex.split(line)
     return build_parser(given).parse_args(given)
 
 

@@ -1,4 +1,4 @@
-"""pi0.5 of LeRobot, in 0.4 with openpi's layers: one checkpoint, also through `vla-capture pi`."""
+"""pi0.5 of LeRobot, in 0.4 with openpi's layers: one checkpoint, also through `vla-attention capture pi`."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ def test_links_are_those_of_the_site():
 def test_every_command_has_its_help_text():
     text = help_texts()
     headings = re.findall(r"^#+ `(.*)`$", text, re.MULTILINE)
-    assert {f"vla-analyze {command}" for command in COMMANDS} <= set(headings)
-    assert {f"vla-capture {family.name}" for family in policy_families()} <= set(headings)
-    assert "vla-capture replay" in headings
+    assert {f"vla-attention {command}" for command in COMMANDS} <= set(headings)
+    assert {f"vla-attention capture {family.name}" for family in policy_families()} <= set(headings)
+    assert "vla-attention capture replay" in headings
     assert len(headings) == text.count("usage: ") == len(set(headings))
-    assert commands_of("vla-analyze") == list(COMMANDS)
+    assert commands_of("vla-attention") == list(COMMANDS)

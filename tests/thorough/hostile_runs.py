@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-#: Makes a case in an empty folder; returns the arguments of `vla-capture` that read it.
+#: Makes a case in an empty folder; returns the arguments of `vla-attention capture` that read it.
 Make = Callable[[Path], list[str]]
 #: A folder of a case from which packages are imported instead of the installed ones.
 PACKAGES = "packages"

@@ -1,6 +1,6 @@
 """pi0, pi0.5 and pi0-FAST as other packages run them: openpi's PyTorch code, LeRobot, transformers 5.
 
-This project has the networks of pi0 and pi0.5 itself (`vla-capture pi`, which needs none of these packages); the
+This project has the networks of pi0 and pi0.5 itself (`capture pi`, which needs none of these packages); the
 layouts are for recording them where they run already: inside openpi's websocket server, inside lerobot-eval.
 """
 

@@ -234,4 +234,4 @@ def test_a_mistake_of_the_user_ends_the_run(scene, tmp_path, capsys, num_envs):
 
     scene.make = Refusing
     assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 2
-    assert capsys.readouterr().err == "vla-capture: The assets are missing; set VLA_LIBERO_ASSETS.\n"
+    assert capsys.readouterr().err == "vla-attention capture: The assets are missing; set VLA_LIBERO_ASSETS.\n"

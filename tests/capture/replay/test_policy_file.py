@@ -1,4 +1,4 @@
-"""`vla-capture replay --policy FILE.py`: a policy that no family knows, on a data set, through `va.record`."""
+"""`capture replay --policy FILE.py`: a policy that no family knows, on a data set, through `va.record`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`vla-capture replay`: the rows of a run come back from its pictures, and every robot has its own columns."""
+"""`capture replay`: the rows of a run come back from its pictures, and every robot has its own columns."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def test_mistakes_end_with_one_line(tmp_path, capsys, monkeypatch):
         assert run("replay", data, *TINY, "--output", "replay.zarr", *options) == 2
         error = capsys.readouterr().err
         assert re.search(named, error)
-        assert error.startswith("vla-capture: ")
+        assert error.startswith("vla-attention capture: ")
         assert "Traceback" not in error
     assert not list(tmp_path.rglob("*.zarr"))
 

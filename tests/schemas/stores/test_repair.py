@@ -1,4 +1,4 @@
-"""`vla-capture verify --repair`, and what `status` and `--resume` say of damaged episodes."""
+"""`vla-attention capture verify --repair`, and what `status` and `--resume` say of damaged episodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run every hostile case as `vla-capture` in a process of its own, with a limit of memory; prints a line of JSON each.
+"""Run every hostile case as `capture` in a process of its own, with a limit of memory; prints a line of JSON each.
 
     python -m tests.thorough.hostile_checkpoints.run_cases FOLDER [NAME ...]
 

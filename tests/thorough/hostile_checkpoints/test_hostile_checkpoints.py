@@ -39,7 +39,7 @@ def test_a_hostile_checkpoint_is_refused_with_a_sentence(results, name):
     said = result["output"].strip()
     assert result["code"] == 2, result
     assert "Traceback" not in said
-    refusals = [line for line in said.split("\n") if line.startswith("vla-capture")]
+    refusals = [line for line in said.split("\n") if line.startswith("vla-attention capture")]
     assert len(refusals) == 1, said
     assert re.search(CASES[name].sentence, refusals[0]), refusals[0]
     assert all(line.isprintable() for line in said.split("\n"))

@@ -1,4 +1,4 @@
-"""Run every hostile data set through `vla-capture replay` in a process of its own; prints a line of JSON each.
+"""Run every hostile data set through `capture replay` in a process of its own; prints a line of JSON each.
 
 python -m tests.thorough.hostile_data_sets.run_cases FOLDER [NAME ...]
 """
