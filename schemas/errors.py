@@ -109,14 +109,6 @@ def plural(count: int, noun: str) -> str:
     return f"{count} {noun[:-1]}ies" if noun.endswith("ty") else f"{count} {noun}s"
 
 
-#: torch, MuJoCo, robosuite and what belongs to them.
-INSTALL_CAPTURE = "pip install 'vla-attention[capture]', or 'make setup' in a checkout"
-#: LIBERO's assets, 0.6 GB.
-INSTALL_LIBERO_ASSETS = "pip install 'vla-attention[libero-assets]', or 'make libero-assets' in a checkout"
-#: LIBERO without what it declares (scripts/constraints.txt has the same versions).
-INSTALL_LIBERO = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
-
-
 def visible(text: str, keep: str = "") -> str:
     r"""Text with its unprintable characters as escapes, for instance \x1b, \n or \u202e.
 

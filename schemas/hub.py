@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 from vla_attention.schemas.errors import MissingDependency, UserError, plural
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.safe_text import plain_stderr
 
 #: `ORG/NAME`, or `ORG/NAME@REVISION` with a commit, a branch or a tag.
@@ -136,7 +137,7 @@ def fetch_from_hub(
     except ImportError as error:
         raise MissingDependency(
             f"'{repository}' is a name on the Hugging Face hub, whose client is not installed; install it with "
-            f"`pip install 'vla-attention[hub]'`, or {how}."
+            f"`{install_line('hub')}`, or {how}."
         ) from error
     try:
         folder = snapshot_download(repository, repo_type=kind, revision=revision, allow_patterns=list(patterns))

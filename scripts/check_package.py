@@ -317,7 +317,7 @@ def use_examples(laptop: Path, folder: Path) -> None:
     )
     sentence = refused.stderr.strip()
     check(
-        refused.returncode == 2 and "pip install 'vla-attention[capture]'" in sentence and "\n" not in sentence,
+        refused.returncode == 2 and "pip install 'vla-attention[capture] @ file:" in sentence and "\n" not in sentence,
         f"without torch, capture ends with {refused.returncode} and: {sentence}",
     )
 

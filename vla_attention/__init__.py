@@ -198,8 +198,9 @@ def _module_of_the_recorder(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        from vla_attention.schemas.errors import INSTALL_CAPTURE, MissingDependency
+        from vla_attention.schemas.errors import MissingDependency
+        from vla_attention.schemas.install_line import install_line
 
         raise MissingDependency(
-            f"torch is not installed, and va.record and va.inspect need it: {INSTALL_CAPTURE}."
+            f"torch is not installed, and va.record and va.inspect need it: {install_line('capture')}."
         ) from error

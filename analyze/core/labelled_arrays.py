@@ -29,6 +29,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import key_error_bound, mass_error_bound
 from vla_attention.schemas.safe_text import visible
@@ -177,6 +178,6 @@ def _xarray() -> Any:
         import xarray
     except ImportError:
         raise MissingDependency(
-            "Labelled arrays need xarray, which is not installed; pip install 'vla-attention[xarray]'."
+            f"Labelled arrays need xarray, which is not installed; {install_line('xarray')}."
         ) from None
     return xarray

@@ -18,6 +18,7 @@ from vla_attention.analyze.render.files import replacing
 from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import Style
 from vla_attention.schemas.errors import BadArgument, MissingDependency
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
@@ -78,8 +79,8 @@ def check_video(kind: VideoFormat) -> None:
             import imageio_ffmpeg  # noqa: F401
         except ImportError:
             raise MissingDependency(
-                "Writing MP4 needs imageio-ffmpeg, which is not installed; pip install 'vla-attention[video]', or "
-                "choose --video gif."
+                f"Writing MP4 needs imageio-ffmpeg, which is not installed; {install_line('video')}, or choose "
+                "--video gif."
             ) from None
 
 

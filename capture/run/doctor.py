@@ -24,7 +24,8 @@ from vla_attention.capture.machine import memory_limits
 from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.schemas.command_line import describe_os_error, format_bytes
-from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, listing, plural
+from vla_attention.schemas.errors import UserError, listing, plural
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.libero_physics import MEND, what_differs
 from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.stores.root import episode_folders
@@ -67,7 +68,7 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
     try:
         import torch
     except ImportError as error:
-        said = f"torch cannot be loaded ({error}). Install it: {INSTALL_CAPTURE}."
+        said = f"torch cannot be loaded ({error}). Install it: {install_line('capture')}."
         look("torch", lambda: ("MISSING", said))  # what reads checkpoints needs it
     else:
         look("GPU", lambda: find_gpu(arguments.device, torch))

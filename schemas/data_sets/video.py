@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.data_sets.data_set_files import DamagedDataSet, DataSetError, DataSetNotFound
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.install_line import install_line
 
 #: How many pictures before the wanted one decoding begins, one after the other until the picture comes out whole: a
 #: seek may end behind it, and in an open group pictures need the group before.
@@ -39,8 +40,7 @@ def import_av() -> Any:
         import av.error
     except ImportError as error:
         raise MissingDependency(
-            "Videos are decoded with PyAV, which is not installed; install it with "
-            "`pip install 'vla-attention[datasets]'`."
+            f"Videos are decoded with PyAV, which is not installed; install it with `{install_line('datasets')}`."
         ) from error
     return av
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.foreign_files import MAX_DOCUMENT_BYTES
+from vla_attention.schemas.install_line import install_line
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress, StorePlace, StoreUrl, stated_commit
 
@@ -224,7 +225,7 @@ def _hub_listing(url: str) -> tuple[Any, str]:
 def _missing(url: str, error: ImportError) -> RemoteFailure:
     return RemoteFailure(
         f"Reading {url} needs a package that is not installed ({error.name or error}); "
-        "pip install 'vla-attention[remote]', or copy the store here."
+        f"{install_line('remote')}, or copy the store here."
     )
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from tests.kit.archives import example_store
 from vla_attention.__main__ import main
+from vla_attention.schemas.install_line import install_line
 
 
 def test_analyze_is_vla_analyze(capsys):
@@ -38,7 +39,7 @@ def test_without_torch_a_capture_says_how_to_install_it(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert "pip install 'vla-attention[capture]'" in done.stderr
+    assert install_line("capture") in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "new.zarr").exists()
 
@@ -56,4 +57,4 @@ def test_without_torch_the_recorder_says_how_to_install_it():
     assert len(lines) == 2
     for line in lines:
         assert line.startswith("MissingDependency torch")
-        assert "pip install 'vla-attention[capture]'" in line
+        assert install_line("capture") in line

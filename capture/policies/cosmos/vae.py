@@ -20,6 +20,7 @@ from vla_attention.capture.policies.checkpoints import check_size
 from vla_attention.capture.policies.cosmos.config import VaeConfig
 from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.schemas.errors import MissingDependency
+from vla_attention.schemas.install_line import install_line
 
 #: Pixel frames of every latent frame but the first, which has one.
 FRAMES_PER_LATENT = 4
@@ -32,8 +33,8 @@ def _build_wan(config: VaeConfig) -> Any:
         library = import_module("diffusers.models.autoencoders.autoencoder_kl_wan")
     except ImportError as error:
         raise MissingDependency(
-            f"Cosmos policies need diffusers for their image encoder ({error}); install it with `pip install "
-            "'vla-attention[cosmos]'`."
+            f"Cosmos policies need diffusers for their image encoder ({error}); install it with "
+            f"`{install_line('cosmos')}`."
         ) from error
     return library.AutoencoderKLWan(
         base_dim=config.base_dim,

@@ -26,6 +26,7 @@ from vla_attention.capture.policies.weights import Shapes, check_floats, check_s
 from vla_attention.schemas.checked_files import check_folder
 from vla_attention.schemas.errors import MissingDependency
 from vla_attention.schemas.hub import first_line
+from vla_attention.schemas.install_line import install_line
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def import_tensorstore() -> Any:
     except ImportError as error:
         raise MissingDependency(
             "Checkpoints in openpi's JAX format are read with tensorstore, which is not installed; "
-            "install it with `pip install 'vla-attention[openpi]'`."
+            f"install it with `{install_line('openpi')}`."
         ) from error
     return tensorstore
 

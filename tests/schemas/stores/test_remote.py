@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
+pytest.importorskip("aiohttp", reason="needs the extra remote: pip install '.[remote]'")
 
 
 from tests.kit.http_ranges import Served, serve

@@ -20,7 +20,7 @@ from vla_attention.schemas.stores.verify import verify_store
 
 pytestmark = pytest.mark.thorough
 
-pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
+pytest.importorskip("aiohttp", reason="needs the extra remote: pip install '.[remote]'")
 
 
 COMMIT = "a" * 40

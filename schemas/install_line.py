@@ -1,0 +1,37 @@
+"""The line that adds an extra to this installation, from where the installation came."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+#: LIBERO without what it declares (scripts/constraints.txt has the same versions).
+INSTALL_LIBERO = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
+
+
+def install_line(extra: str) -> str:
+    """`pip install '/home/me/vla-attention[EXTRA]'`, of a clone; of a wheel or a repository its address.
+
+    Read from what pip noted of the installation (PEP 610). Without such a note it came from a package index.
+    """
+    try:
+        noted = distribution("vla-attention").read_text("direct_url.json")
+    except PackageNotFoundError:  # a checkout on Python's path
+        root = Path(__file__).resolve().parents[1]
+        noted = json.dumps({"url": root.as_uri(), "dir_info": {"editable": True}})
+    origin = json.loads(noted) if noted else {}
+    name = f"vla-attention[{extra}]"
+    if not origin:
+        wanted = name
+    elif "dir_info" in origin:
+        wanted = f"{url2pathname(urlsplit(origin['url']).path)}[{extra}]"
+    elif "vcs_info" in origin:
+        wanted = f"{name} @ {origin['vcs_info']['vcs']}+{origin['url']}@{origin['vcs_info']['commit_id']}"
+    else:
+        wanted = f"{name} @ {origin['url']}"
+    editable = "-e " if origin.get("dir_info", {}).get("editable") else ""
+    return f"pip install {editable}{shlex.quote(wanted)}"
