@@ -18,7 +18,7 @@ _PROGRAM = "vla-attention capture"
 #: What is said after Ctrl-C.
 IF_STOPPED = "complete episodes are kept, continue with --resume."
 #: Commands that record nothing, and what is said of them.
-_RECORD_NOTHING = ("doctor", "status", "tasks", "verify")
+_RECORD_NOTHING = ("doctor", "slurm", "status", "tasks", "verify")
 _IF_LOOKING = "nothing was left half written."
 
 

@@ -254,6 +254,8 @@ def capture_and_analyse(laptop: Path, node: Path, folder: Path) -> None:
     run(node / "python", "-m", f"{PACKAGE}.capture", "pi", *short, "--output", store, cwd=folder, quiet=True)
     code = json.loads((store / "zarr.json").read_text())["attributes"]["provenance"]["code"]
     check(code == version(), f"the store was made by code version {code}, expected {version()}")
+    run(node / "vla-attention", "capture", "slurm", folder / "batch", cwd=folder, quiet=True)
+    check((folder / "batch/submit_attention_ratio.sh").is_file(), "capture slurm wrote no scripts")
     run(laptop / "vla-attention", "analyze", store, "--output", output, cwd=folder, quiet=True)
     run(laptop / "python", "-m", f"{PACKAGE}.analyze", "store", "verify", store, cwd=folder, quiet=True)
     run(laptop / "vla-attention", "report", store, "--output", output / "report.html", cwd=folder, quiet=True)

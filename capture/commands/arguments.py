@@ -222,6 +222,24 @@ def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:
     return 0
 
 
+def _add_slurm_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    parser.add_argument(
+        "folder",
+        nargs="?",
+        type=Path,
+        default=Path("scripts"),
+        metavar="FOLDER",
+        help="where to (default: %(default)s)",
+    )
+    parser.set_defaults(command=_run_slurm)
+
+
+def _run_slurm(arguments: argparse.Namespace, termination: Termination) -> int:
+    from vla_attention.capture.jobs.batch_scripts import write_batch_scripts
+
+    return write_batch_scripts(arguments.folder)
+
+
 #: Commands beside those of the policy families: what each is for, in a line and in sentences, examples, and what adds
 #: its arguments to a parser, which may go by the words that will be parsed.
 _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser, Sequence[str]], None]]] = {
@@ -269,6 +287,13 @@ _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser, Seq
         verify_command.DESCRIPTION,
         verify_command.EXAMPLES.removeprefix("examples:\n").replace("NAME", "vla-attention capture"),
         _add_verify_arguments,
+    ),
+    "slurm": (
+        "write the batch scripts of a SLURM cluster into a folder",
+        "One job, or a job per task into one store and an analysis after them; their options are environment "
+        "variables. See docs/my-cluster.md.",
+        "",
+        _add_slurm_arguments,
     ),
     "tasks": ("the tasks of a suite", "The tasks of a suite by their ids.", "", _add_tasks_arguments),
 }

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import vla_attention
+from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.policies.cosmos.family import FAMILY as COSMOS
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.pi.family import FAMILY as PI
@@ -54,6 +55,20 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(tmp_path, script, variable
     assert re.search(named, done.stderr)
     assert done.stderr.count("\n") == 1
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_an_installation_without_a_clone_has_the_scripts(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        assert capture(["slurm"]) == 0
+    written = {path.name: path.read_bytes() for path in (tmp_path / "scripts").iterdir()}
+    assert written == {path.name: path.read_bytes() for path in SCRIPTS.glob("*_attention_ratio*.sh")}
+    assert all(os.access(tmp_path / "scripts" / name, os.X_OK) for name in written)
+    capsys.readouterr()
+    (tmp_path / "scripts/run_attention_ratio.sh").write_text("mine")
+    assert capture(["slurm"]) == 2
+    assert "scripts/run_attention_ratio.sh: there already" in capsys.readouterr().err
+    assert (tmp_path / "scripts/run_attention_ratio.sh").read_text() == "mine"
 
 
 def test_the_helper_prints_what_it_would_submit(tmp_path):
