@@ -21,8 +21,8 @@ def install_line(extra: str) -> str:
     try:
         noted = distribution("vla-attention").read_text("direct_url.json")
     except PackageNotFoundError:  # a checkout on Python's path
-        root = Path(__file__).resolve().parents[1]
-        noted = json.dumps({"url": root.as_uri(), "dir_info": {"editable": True}})
+        roots = [folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file()]
+        noted = json.dumps({"url": roots[0].as_uri(), "dir_info": {"editable": True}}) if roots else None
     origin = json.loads(noted) if noted else {}
     name = f"vla-attention[{extra}]"
     if not origin:

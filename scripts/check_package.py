@@ -43,13 +43,20 @@ SOURCES_OF_THE_PAGE = f"{PACKAGE}/analyze/view/web/"
 TOP_OF_SDIST = {
     PACKAGE,
     f"{PACKAGE}.egg-info",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
     "LICENSE",
     "MANIFEST.in",
+    "Makefile",
     "PKG-INFO",
     "README.md",
+    "benchmarks",
+    "docs",
     "examples",
     "pyproject.toml",
+    "scripts",
     "setup.cfg",
+    "tests",
 }
 #: Run in an environment, outside the checkout; prints the version. Imports of the folders' own names must fail.
 CHECK_IMPORTS = """
