@@ -18,7 +18,7 @@ from vla_attention.schemas.safe_text import check_name, check_text, visible
 
 Queries = Literal["action", "all", "prefix"]
 #: What another sentence is to the task's own. `exchanged`: a word of it for one that other tasks of its family have.
-PromptKind = Literal["paraphrased", "exchanged", "contradicted", "other task", "empty", "shuffled"]
+PromptKind = Literal["written otherwise", "paraphrased", "exchanged", "contradicted", "other task", "empty", "shuffled"]
 _READERS: dict[Queries, str] = {
     "action": "the action queries",
     "all": "all queries",

@@ -65,13 +65,20 @@ def print_line(text: str) -> None:
 
 
 class _VisibleStream:
-    """An output stream that writes text `visible`, line ends apart. Everything else is the wrapped stream's."""
+    """An output stream that writes text `visible`, line ends apart. Everything else is the wrapped stream's.
+
+    What its encoding lacks is written as escapes; three dots in one sign, which latin-1 lacks, as three.
+    """
 
     def __init__(self, stream: IO[str]) -> None:
         self._wrapped = stream  # under this name tqdm recognises the stream of its bar
 
     def write(self, text: str) -> int:
-        self._wrapped.write(visible(text, keep=_LINE_END))
+        shown, encoding = visible(text, keep=_LINE_END), getattr(self._wrapped, "encoding", None) or "utf-8"
+        try:
+            self._wrapped.write(shown)
+        except UnicodeEncodeError:
+            self._wrapped.write(shown.replace("\u2026", "...").encode(encoding, "backslashreplace").decode(encoding))
         return len(text)
 
     def writelines(self, lines: Any) -> None:

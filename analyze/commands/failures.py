@@ -102,7 +102,8 @@ def _why(question: Question, failed: Sequence[SelectedEpisode], num_known: int, 
     few = f"Fewer than {_FEW} failures: this describes them and says nothing of others." if len(failed) < _FEW else ""
     if lost.is_empty():
         said = f"{begin}. Nobody knows what they did: the store holds no steps (positions, touches, goals), which our "
-        return [Finding(f"{said}simulators record.", _WHY, numbers, few, "vla-attention capture --help")]
+        look = f"vla-attention view {shlex.join(str(store.path) for store in question.stores)}"
+        return [Finding(f"{said}simulators record.", _WHY, numbers, few, look)]
     groups = _instead(lost).shown
     parts = [_group(row) for row in groups.head(3).iter_rows(named=True)]
     parts += [f"{rest} did other things"] if (rest := groups["episodes"][3:].sum()) else []

@@ -45,7 +45,7 @@ def listens(asked: pl.DataFrame) -> Finding:
             "Nobody knows what it did: the store holds no steps (positions, touches, goals), which our simulators "
             "record. A rerun of stored calls does nothing of its own.",
             LISTENS,
-            next_step="vla-attention capture --help",
+            next_step="va.language_test(call, inputs, sentences)   # Python, with your policy: does its action change?",
         )
     shown, n = asked.filter(pl.col("left_out").is_null()), asked.height
     rest = [*asked.drop_nulls("left_out")["left_out"].value_counts(sort=True).sort("left_out").iter_rows()]

@@ -118,20 +118,22 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
 
     from vla_attention.analyze.view.static_site import site_size, write_page_file, write_site
     from vla_attention.schemas.command_line import format_bytes
-    from vla_attention.schemas.errors import Note
+    from vla_attention.schemas.errors import Note, plural
 
     # Before the numbers of all episodes are waited for.
-    episode = None if arguments.file is None else _wanted(arguments, stores[0].store)[0]
+    episodes = [] if arguments.file is None else _wanted(arguments, stores[0].store)
     if arguments.site is not None:
         about = format_bytes(site_size(stores, arguments.heads))
         print(f"About {about} for {sum(len(store.store.episodes) for store in stores)} episodes.", flush=True)
     for store in stores:
         if failed := store.summary.wait():
             warnings.warn(f"Not every episode of {store.store.path} has numbers: {failed}", Note, stacklevel=2)
-    if episode is None:
+    if not episodes:
         print(write_site(arguments.site, stores, arguments.heads))
-    else:
-        print(write_page_file(arguments.file, stores[0], episode, arguments.heads))
+        return
+    print(write_page_file(arguments.file, stores[0], episodes[0], arguments.heads))
+    if others := len(episodes) - 1:
+        print(f"The store has {plural(others, 'other episode')} of those asked for; --task and --episode choose one.")
 
 
 def _write_recordings(arguments: argparse.Namespace, store: Store) -> None:

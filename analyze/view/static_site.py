@@ -100,7 +100,7 @@ def write_page_file(path: Path, store: ServedStore, episode: StoredEpisode, head
         index = index.replace(mark, part, 1)
     with writing("page", path, instead="another --file"):
         write_text(path, index)
-    return f"{path}: {format_bytes(len(index.encode()))}, opens in a browser from disk."
+    return f"{path}: {episode.name}, {format_bytes(len(index.encode()))}, opens in a browser from disk."
 
 
 @contextmanager

@@ -71,7 +71,8 @@ class EffectSettings:
 
     prompts: str = option(
         "the instruction exchanged for the sentences of a table, table:FILE.csv or .toml (task, sentence, kind), or "
-        "standard: empty, shuffled, of other tasks, a word exchanged, paraphrased and contradicted, and the cameras",
+        "standard: written otherwise (a full stop, a capital), empty, shuffled, of other tasks, a word exchanged, "
+        "paraphrased and contradicted, and the cameras",
         "",
         name="prompts",
         metavar="TABLE",

@@ -30,6 +30,7 @@ COLUMNS = ("task", "sentence", "kind")
 _MOST_BYTES = 1_000_000
 #: So a spreadsheet's formula begins, and sentences are written into tables that spreadsheets open.
 _FORMULA = ("=", "+", "-", "@")
+_WRITTEN_OTHERWISE = "written otherwise"
 #: Sentences of other tasks that a task is told.
 _OTHERS = 3
 
@@ -73,9 +74,12 @@ def with_rows(
 
 
 def _made_of(tasks: Sequence[tuple[int, str, str]], scenes: Mapping[int, Mapping[int, str]]) -> Iterator[OtherPrompt]:
-    """The rows that need no table: no words, shuffled ones, one exchanged, and those of the next tasks of the scene."""
+    """The rows that need no table: the same words in another case or with a full stop, no words, shuffled ones, one
+    exchanged, and those of the next tasks of the scene.
+    """
     siblings, all_tasks = siblings_of(tasks), {number: text for number, text, _ in tasks}
     for number, instruction, _ in tasks:
+        yield from (OtherPrompt(number, "written otherwise", sentence) for sentence in _written_otherwise(instruction))
         yield from (OtherPrompt(number, "empty"), OtherPrompt(number, "shuffled"))
         told = {folded_words(instruction)}
         for change in exchanges(instruction, siblings[number]):
@@ -88,6 +92,17 @@ def _made_of(tasks: Sequence[tuple[int, str, str]], scenes: Mapping[int, Mapping
         others = sharing or {other: text for other, text in all_tasks.items() if folded_words(text) not in told}
         nearest = sorted(others, key=lambda other: (other < number, other))[:_OTHERS]  # behind it, then from the first
         yield from (OtherPrompt(number, "other task", others[other]) for other in nearest)
+
+
+def _written_otherwise(instruction: str) -> tuple[str, ...]:
+    """The sentence with a full stop, or without its own, and with a capital, or without its own.
+
+    >>> _written_otherwise("open it")
+    ('open it.', 'Open it')
+    """
+    turned = instruction[:1].swapcase() + instruction[1:]
+    stopped = instruction[:-1] if instruction.endswith(".") else f"{instruction}."
+    return (stopped, turned) if turned != instruction else (stopped,)
 
 
 def shipped_prompts(suite: str, instructions: Mapping[int, str]) -> Iterator[OtherPrompt]:
@@ -104,7 +119,7 @@ def read_prompt_table(path: Path, instructions: Mapping[int, str]) -> list[Other
         BadArgument: something is wrong with the file or with a row; names the line, what was expected and what exists.
     """
     # Conditions are told apart by their names, in which commas and hyphens are alike.
-    found = {(number, folded_words(plain(text)), False): "its own instruction" for number, text in instructions.items()}
+    found: dict[tuple[int, str | tuple[str, ...], bool], str] = {}
     rows = []
     for where, row in _rows_of(path):
         kinds, sentence = get_args(PromptKind), row["sentence"]
@@ -118,7 +133,14 @@ def read_prompt_table(path: Path, instructions: Mapping[int, str]) -> list[Other
             if sentence.startswith(_FORMULA):
                 raise BadArgument(f"'{sentence}' begins as a formula of a spreadsheet; expected words.")
             for number in numbers:
-                key = number, folded_words(plain(sentence)), row["kind"] == "empty"
+                own, kind = instructions[number], row["kind"]
+                same_words = folded_words(sentence) == folded_words(own)
+                if kind != "empty" and (same_words != (kind == _WRITTEN_OTHERWISE) or sentence == own):
+                    raise BadArgument(
+                        f"'{sentence}' is no '{kind}' sentence of task {number}, '{own}': '{_WRITTEN_OTHERWISE}' has "
+                        "the same words in another case or punctuation, and every other kind has other words."
+                    )
+                key = number, plain(sentence) if same_words else folded_words(plain(sentence)), kind == "empty"
                 if key in found:
                     raise BadArgument(f"Task {number} has the same words in {found[key]}; expected each once.")
                 found[key] = where

@@ -139,6 +139,10 @@ def check_target(path: Path, mode: WriteMode) -> None:
     check_writable(path.parent, "--output")
 
 
+#: As a command's option and as an argument of `va.record`.
+RESUME, OVERWRITE = "--resume (in Python resume=True)", "--overwrite (overwrite=True)"
+
+
 def refuse_recorded(path: Path) -> None:
     """Raise `StoreExists` if a store with episodes is at `path`, and `StoreError` if it is no store.
 
@@ -149,8 +153,8 @@ def refuse_recorded(path: Path) -> None:
     read_existing_root(path)
     if count := len(episode_folders(path)):
         raise StoreExists(
-            f"Store {path} exists already and holds {plural(count, 'episode')}; add --resume to continue it, "
-            "--overwrite to delete it and begin again, or give another --output."
+            f"Store {path} exists already and holds {plural(count, 'episode')}; continue it with {RESUME}, delete it "
+            f"and begin again with {OVERWRITE}, or write to another store."
         )
 
 
@@ -161,8 +165,8 @@ def _take_empty(path: Path, attributes: RootAttributes) -> None:
         return
     if _is_being_recorded(path):
         raise StoreExists(
-            f"Store {path} holds no episode yet, and another run is recording its first one; wait for it, add "
-            "--overwrite to delete the store and begin again, or give another --output."
+            f"Store {path} holds no episode yet, and another run is recording its first one; wait for it, delete the "
+            f"store and begin again with {OVERWRITE}, or write to another store."
         )
     delete_store(path)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.errors import shortened
+from vla_attention.schemas.errors import plural, shortened
 from vla_attention.schemas.groupings.grouping import REST, Grouping, GroupingError
 from vla_attention.schemas.groupings.selector_parser import (
     Atom,
@@ -157,9 +157,9 @@ def _raise_overlap(group: str, member: Membership, others: dict[str, Membership]
         if shared.any():
             key = int(np.flatnonzero(shared)[0])
             raise OverlappingGroups(
-                f"Groups '{other}' and '{group}' share {int(shared.sum())} keys "
+                f"Groups '{other}' and '{group}' share {plural(int(shared.sum()), 'token')} "
                 f"(the first is {describe_key(key, tokens)}); "
-                "take them out of one group with ' - ', or set overlap = true."
+                "take them out of one group with ' - ', or write the groups into a file with overlap = true."
             )
 
 

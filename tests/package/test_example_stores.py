@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from pathlib import Path
+
 import polars as pl
 import pytest
 
@@ -11,6 +15,8 @@ from tests.kit.paths import ROOT
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.example_stores import EXAMPLES, FOLDER
 from vla_attention.example_stores.command import main
+from vla_attention.schemas.stores import tar_files
+from vla_attention.schemas.stores.tar_files import unpack
 
 CUBES, ONE_COLOUR, NOISE = map(example_store, EXAMPLES)
 
@@ -66,6 +72,21 @@ def test_copies_are_readable_and_none_is_written_over(tmp_path, capsys):
     assert va.open(folder / "cubes.zarr").episodes[columns].equals(va.open(CUBES).episodes[columns])
     assert main([str(folder)]) == 2
     assert "cubes.zarr" in capsys.readouterr().err
+
+
+def test_on_a_full_disk_there_is_no_part_of_a_store(tmp_path, monkeypatch, capsys):
+    left = [2]
+
+    def until_full(archive: Path, into: Path) -> None:
+        left[0] -= 1
+        unpack(archive, into)
+        if not left[0]:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tar_files, "unpack", until_full)
+    assert main([str(tmp_path / "example")]) == 2
+    assert "No space left" in capsys.readouterr().err
+    assert list((tmp_path / "example").iterdir()) == []
 
 
 def test_an_example_is_unpacked_once(tmp_path, monkeypatch):

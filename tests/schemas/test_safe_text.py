@@ -93,3 +93,15 @@ def test_what_a_block_prints_is_visible_and_the_rest_of_the_streams_is_theirs(mo
         assert not sys.stdout.isatty()
     assert (sys.stdout, sys.stderr) == (out, err)
     assert (out.getvalue(), err.getvalue()) == ("a\\x1b[1m\nb\n", "c\\u202e\n")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "written"), [("latin-1", b"pot...\xd7 \\u2581\n"), ("utf-8", "pot\u2026\xd7 \u2581\n".encode())]
+)
+def test_a_terminal_of_another_encoding_shows_what_it_can(monkeypatch, encoding, written):
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding=encoding, newline="\n")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    with visible_output():
+        print("pot\u2026\xd7 \u2581")
+    terminal.flush()
+    assert terminal.buffer.getvalue() == written

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from vla_attention.example_stores import EXAMPLES, archive_of
 from vla_attention.schemas.command_line import OneSentenceParser, run_command
@@ -38,7 +39,7 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("example"), metavar="FOLDER", help="where to")
     folder: Path = parser.parse_args(argv).folder
-    return run_command(PROGRAM, lambda: _copy(folder), "a copy may be incomplete; remove it and copy again.")
+    return run_command(PROGRAM, lambda: _copy(folder), "nothing was left half written.")
 
 
 def _copy(folder: Path) -> int:
@@ -50,7 +51,11 @@ def _copy(folder: Path) -> int:
 
     refuse_in_store(folder, "copy stores to")
     folder.mkdir(parents=True, exist_ok=True)
-    for name in copies:
-        unpack(archive_of(name), folder)
+    # On a full disk there is no store, rather than half of one.
+    with TemporaryDirectory(dir=folder, prefix=".copying-") as part:
+        for name in copies:
+            unpack(archive_of(name), Path(part))
+        for store in copies.values():
+            (Path(part) / store.name).rename(store)
     print(_QUESTIONS.format(**copies), end="")
     return 0

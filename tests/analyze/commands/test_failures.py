@@ -157,7 +157,7 @@ def test_nothing_failed_is_said():
 def test_without_steps_the_next_step_is_named(tmp_path):
     found = failures(question_about(write_store(tmp_path / "a.zarr")))
     assert found.findings[0].numbers == {"failed": 2, "n": 4}
-    assert found.findings[0].next_step.startswith("vla-attention capture")
+    assert found.findings[0].next_step.startswith("vla-attention view")
 
 
 def test_mistakes(tmp_path, planted, capsys):

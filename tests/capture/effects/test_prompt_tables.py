@@ -24,6 +24,7 @@ TASKS = {0: "lift the red cube", 1: "stack the red cube on top of the green cube
 TABLE = (
     "task,sentence,kind\n0,raise the cube that is red please,paraphrased\n"
     "stack the red cube on top of the green cube,touch nothing,contradicted\n0,,empty\n0,,shuffled\n"
+    "0,Lift the red cube,written otherwise\n0,lift the red cube.,written otherwise\n"
 )
 TOML = """[[prompt]]
 task = 0
@@ -46,7 +47,10 @@ kind = "paraphrased"
         ("a.csv", "task,sentence,kind\n0,go,empty\n", "line 2: .*'empty'"),
         ("a.csv", "task,sentence,kind\n0,,paraphrased\n", "line 2: .*'paraphrased'"),
         ("a.csv", "task,sentence,kind\n0,Go!,paraphrased\n0,go,contradicted\n", "line 3: Task 0 .*line 2"),
-        ("a.csv", "task,sentence,kind\n0,Lift the red cube.,shuffled\n", "line 2: Task 0 "),
+        ("a.csv", "task,sentence,kind\n0,Lift the red cube.,shuffled\n", "line 2: .*Lift.*no 'shuffled'.*task 0"),
+        ("a.csv", "task,sentence,kind\n0,Lift a cube.,written otherwise\n", "line 2: .*'Lift a cube.'.*same words"),
+        ("a.csv", "task,sentence,kind\n0,lift the red cube,written otherwise\n", "line 2: .*another case"),
+        ("a.csv", "task,sentence,kind\n" + "0,Lift the red cube,written otherwise\n" * 2, "line 3: .*line 2"),
         ("a.csv", "task,sentence,kind\n" + "0,go,empty\n" * 100_000, "1,100,019 bytes; .* 1,000,000"),
         ("a.csv", b"\xff\xfe", "a.csv"),
         ("a.toml", "task = 1", r"\[\[prompt\]\]"),
@@ -66,6 +70,7 @@ def test_csv_and_toml_are_read_alike(tmp_path):
     rows = read_prompt_table(tmp_path / "a.csv", TASKS)
     assert [(row.task_id, row.kind) for row in rows] == [
         (0, "paraphrased"), (1, "contradicted"), (0, "empty"), (0, "shuffled"),
+        (0, "written otherwise"), (0, "written otherwise"),
     ]  # fmt: skip
     assert read_prompt_table(tmp_path / "a.toml", TASKS) == rows[:1]
 
@@ -80,7 +85,7 @@ def test_our_own_tables_and_the_standard_prompts_are_of_every_task(suite):
     assert made.items == ("cameras",)
     kinds = [row.kind for row in made.rows]
     assert {row.task_id for row in made.rows} == {0}
-    assert {"empty", "shuffled", "other task", "paraphrased", "contradicted"} <= {*kinds}
+    assert {"written otherwise", "empty", "shuffled", "other task", "paraphrased", "contradicted"} <= {*kinds}
     assert ("exchanged" in kinds) == (suite in ("cubes", "libero_object", "libero_10"))
     assert tasks[0][1] not in {row.sentence for row in made.rows}
 
@@ -92,15 +97,16 @@ def test_each_sentence_has_the_effect_of_a_rerun_with_it(pi_store, tmp_path):
     assert main([*given, str(tmp_path / "all.zarr"), "--prompts", f"table:{tmp_path / 'a.csv'}"]) == 0
     made, base = open_store(tmp_path / "all.zarr"), open_store(pi_store)
     assert made.attributes.recording.effects.items == ("prompts",)
-    for change in ("text:raise the cube that is red please", "text:touch nothing", "empty", "shuffled"):
-        assert main([*given, str(tmp_path / f"{change[:8]}.zarr"), "--prompt", change]) == 0
+    texts = ("raise the cube that is red please", "touch nothing", "Lift the red cube", "lift the red cube.")
+    for change in (*(f"text:{text}" for text in texts), "empty", "shuffled"):
+        assert main([*given, str(tmp_path / f"{change[:12]}.zarr"), "--prompt", change]) == 0
     for episode, before in zip(made.episodes, base.episodes, strict=True):
         effects, change = episode.attributes.effects, episode.read("effects/change")
         assert (episode.read("actions") == before.read("actions")).all()
         prompts = [(i, one.prompt) for i, one in enumerate(effects.conditions) if one.prompt]
-        assert len(prompts) == (3 if episode.attributes.task_id == 0 else 1)
+        assert len(prompts) == (5 if episode.attributes.task_id == 0 else 1)
         for number, prompt in prompts:
-            name = (f"text:{prompt.text}" if prompt.text else prompt.kind)[:8]
+            name = (f"text:{prompt.text}" if prompt.text else prompt.kind)[:12]
             again = next(one for one in open_store(tmp_path / f"{name}.zarr").episodes if one.name == episode.name)
             entries = np.flatnonzero(np.array(effects.condition) == number)
             assert len(entries) == episode.attributes.num_replans
