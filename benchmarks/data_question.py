@@ -91,7 +91,7 @@ def asked(kind: str, starts: Sequence[Any], per_sentence: int, draw: int) -> dic
         made = episodes_of(kind, starts, per_sentence, rng)
         folder = write_data_set(Path(place, "set"), "v3.0", made, fps=10, episodes_per_file=1000)
         with contextlib.redirect_stdout(io.StringIO()) as said:
-            code = analyze(["data", str(folder), "--output", f"{place}/out", "--no-plots"], "vla-attention")
+            code = analyze(["data", str(folder), "--output", f"{place}/out", "--no-plots"])
         if code:
             raise SystemExit(said.getvalue())
         result = json.loads(Path(place, "out", "result.json").read_text(encoding="utf-8"))

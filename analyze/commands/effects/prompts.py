@@ -46,10 +46,10 @@ def _moves(found: pl.DataFrame, units: ActionUnits) -> Finding:
     sure, has_noise = found.filter(than_noise=MORE), found["over_noise"].count() > 0
     size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", units.title)
     sizes = dict(found.drop_nulls(size).select("sentence", size).iter_rows())
-    said = "Other words move the action" if sure.height else "No other words are shown to move the action"
-    said += f": {listing([f'{kind} {value:.3g}' for kind, value in sizes.items()], 6)} {unit}."
-    limit = f"Shown to be more than noise: {listing(sure['sentence'], 6)}." if sure.height else ""
-    return Finding(said, "Do other words move it?", sizes | {"n": found["num_episodes"].max()}, limit)
+    said = "Another sentence moves the action" if sure.height else "No other sentence is shown to move the action"
+    said += f": {listing([f'{kind} {value:.3g}' for kind, value in sizes.items()], 7)} {unit}."
+    limit = f"Shown to be more than noise: {listing(sure['sentence'], 7)}." if sure.height else ""
+    return Finding(said, "Does another sentence move it?", sizes | {"n": found["num_episodes"].max()}, limit)
 
 
 def _towards(question: Question, units: ActionUnits) -> tuple[list[Finding], list[Table]]:
