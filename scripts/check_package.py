@@ -179,8 +179,9 @@ def build_packages(folder: Path) -> Path:
     shutil.copytree(ROOT, source, symlinks=True, ignore=LEFT_OUT)
     write_addresses(source / "README.md")
     output = run(sys.executable, "-m", "build", "--outdir", built, source, quiet=True)
-    # PYTHONDONTWRITEBYTECODE alone is no reason to stop.
-    warned = re.findall(r"^(?:WARNING |.*arning: )(?!.*byte-compiling is disabled).*", output, re.M)
+    # PYTHONDONTWRITEBYTECODE is no reason to stop, nor that the copy holds no compiled file to be left out.
+    harmless = "byte-compiling is disabled|no previously-included files matching '(?:\\*\\.py\\[cod\\]|__pycache__)'"
+    warned = re.findall(rf"^(?:WARNING |.*arning: )(?!.*(?:{harmless})).*", output, re.M)
     check(not warned, "the build warns:\n" + "\n".join(warned))
     (sdist,), (wheel,) = built.glob("*.tar.gz"), built.glob("*.whl")
     expected = source_files(source / PACKAGE)
