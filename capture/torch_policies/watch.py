@@ -30,7 +30,7 @@ from vla_attention.capture.torch_policies.attention_calls import AttentionCall, 
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused, Masks
 from vla_attention.capture.torch_policies.fused_calls import FLEX_FUNCTIONS, SDPA_FUNCTIONS, watch_flex, watch_sdpa
 from vla_attention.capture.torch_policies.output_ways import OutputWay, OutputWays
-from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
+from vla_attention.capture.torch_policies.policy_modules import CannotRunEager, FoundPolicy, find_policy
 from vla_attention.capture.torch_policies.products import PRODUCTS
 from vla_attention.capture.torch_policies.softmax_calls import SELECTIONS, SOFTMAXES, Softmaxes
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
@@ -249,7 +249,15 @@ class AttentionMode(TorchFunctionMode):
             yield
 
     def refuse_without_numbers(self, *tensors: Tensor) -> None:
-        """Raise `UnseenAttention` for nested tensors, inside of vmap, and on the meta device."""
+        """Raise an error where numbers cannot be read: nested tensors, vmap, the meta device, a graph's capture."""
+        if torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing():  # type: ignore[no-untyped-call]
+            raise self.failed(
+                CannotRunEager(
+                    f"{self.where()[0] or 'The policy'} computes attention while a CUDA graph is captured: nothing is "
+                    "computed then, and no attention is seen when the graph is replayed. Switch the policy's CUDA "
+                    "graphs off."
+                )
+            )
         for tensor in tensors:
             if _is_wrapped(tensor) or tensor.is_nested or tensor.is_meta:
                 self._refuse_without_numbers(tensors)

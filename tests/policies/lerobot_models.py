@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -369,3 +370,73 @@ def small_multi_task_dit(folder: Path, **changes: Any) -> Any:
     for block in policy.noise_predictor.transformer_blocks:  # zero in a policy that was not trained
         torch.nn.init.normal_(block.adaLN_modulation[-1].weight, std=0.2)
     return policy
+
+
+def small_molmoact2(folder: Path, **changes: Any) -> Any:
+    """LeRobot 0.6's MolmoAct2Policy of three blocks; a small checkpoint with its processor is written into `folder`."""
+    from lerobot.policies.molmoact2.configuration_molmoact2 import MolmoAct2Config
+    from lerobot.policies.molmoact2.modeling_molmoact2 import MolmoAct2Policy
+    from lerobot.policies.molmoact2.molmoact2_hf_model import configuration_molmoact2 as parts
+    from lerobot.policies.molmoact2.molmoact2_hf_model.modeling_molmoact2 import MolmoAct2ForConditionalGeneration
+    from transformers import Qwen2Tokenizer
+
+    pictures = {
+        **{"image_patch_id": "<im_patch>", "image_col_id": "<im_col>", "image_start_token_id": "<im_start>"},
+        **{"low_res_image_start_token_id": "<low_res_im_start>", "image_end_token_id": "<im_end>"},
+        **{"image_low_res_id": "<im_low>", "frame_start_token_id": "<frame_start>"},
+        "frame_end_token_id": "<frame_end>",
+    }
+    names = [*("setup", "control", "state", "action"), "|im"]
+    marks = [f"<{name}_{end}>" for name in names[:-1] for end in ("start", "end")] + ["<|im_start|>", "<|im_end|>"]
+    bins = [f"<state_{number}>" for number in range(16)]
+    # Words are tokens, those around the instruction too.
+    words = f"Image 1 2<|im_start|>user\nThe task is to {' '.join(WORDS)}. The setup The current state of The expected"
+    words += (
+        " control mode. Given these, what action should the robot take to complete the task?<|im_end|>\nassistant\n"
+    )
+    tokenizer = Qwen2Tokenizer().train_new_from_iterator([words] * 2, 500)
+    tokenizer.add_special_tokens(
+        {
+            "eos_token": "<|im_end|>",
+            "additional_special_tokens": [*pictures.values(), *marks, *bins, "<action_output>", "<|image|>"],
+        }
+    )
+    tokenizer.save_pretrained(folder)
+    size = {"size": {"height": 16, "width": 16}, "patch_size": 4, "crop_mode": "resize"}
+    processor = {"image_processor": size, "use_single_crop_col_tokens": False}
+    (folder / "processor_config.json").write_text(json.dumps(processor))
+    heads = {"num_attention_heads": 2, "num_key_value_heads": 2, "head_dim": 8}
+    settings: dict[str, Any] = {
+        **{name: tokenizer.convert_tokens_to_ids(token) for name, token in pictures.items()},
+        **{"eos_token_id": tokenizer.eos_token_id, "num_state_tokens": len(bins)},
+        "state_token_start_id": tokenizer.convert_tokens_to_ids(bins[0]),
+        "vit_config": parts.MolmoAct2VitConfig(
+            **{"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 2, **heads},
+            **{"image_default_input_size": (16, 16), "image_patch_size": 4, "image_num_pos": 16},
+        ),
+        "adapter_config": parts.MolmoAct2AdapterConfig(
+            **{"vit_layers": (-1,), "hidden_size": 16, "intermediate_size": 24, "text_hidden_size": 24, **heads}
+        ),
+        "text_config": parts.MolmoAct2TextConfig(
+            **{"hidden_size": 24, "intermediate_size": 32, "num_hidden_layers": 3, "vocab_size": len(tokenizer)},
+            **{**heads, "num_key_value_heads": 1, "max_position_embeddings": 256, "use_qk_norm": True},
+        ),
+        "action_expert_config": parts.MolmoAct2ActionExpertConfig(
+            **{"hidden_size": 16, "num_layers": 3, "num_heads": 2, "ffn_multiple_of": 8, "timestep_embed_dim": 8}
+        ),
+        "flow_matching_num_steps": 3,
+    }
+    torch.manual_seed(0)
+    model = MolmoAct2ForConditionalGeneration(parts.MolmoAct2Config(**settings))
+    for name, value in model.named_parameters():
+        # Modulation is zero in a policy that was not trained, and pictures are hardly seen.
+        if "modulation" in name or "final_layer" in name or "vision" in name:
+            torch.nn.init.normal_(value, std=0.2)
+    model.save_pretrained(folder)
+    settings = {
+        **features(24, 24),
+        **{"checkpoint_path": str(folder), "model_dtype": "float32", "action_mode": "continuous"},
+        **{"inference_action_mode": "continuous", "enable_inference_cuda_graph": False, "num_state_tokens": 16},
+        **{"chunk_size": 5, "n_action_steps": 4, "setup_type": "robot", "control_mode": "robot"},
+    }
+    return MolmoAct2Policy(MolmoAct2Config(**{**settings, **changes})).eval()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -79,6 +80,18 @@ def record(case: PolicyCase, path: Path, replans: int = 5, **settings: Any) -> A
             most = np.abs(grams[:1]).max(axis=(-1, -2), keepdims=True).clip(1e-9)
             np.testing.assert_allclose(grams / most, np.broadcast_to(grams[:1] / most, grams.shape), atol=1e-5, rtol=0)
     return store
+
+
+def check_inspect(case: PolicyCase, modules: Mapping[str, int]) -> None:
+    """Check that `va.inspect` finds as many calls of modules as blocks times denoise steps, and that none is refused.
+
+    modules: expression for the paths of a site's modules -> number of calls.
+    """
+    found = va.inspect(case.policy, lambda: case.call(case.observation))
+    counts = {path: sum(re.search(path, call.module) is not None for call in found.calls) for path in modules}
+    assert counts == modules
+    assert not any(found.refused)
+    assert max(found.errors) < PRODUCT_TOLERANCE
 
 
 def rows_of(store: Any, site: str) -> np.ndarray:
@@ -196,3 +209,26 @@ def check_analysis(path: Path, sites: Sequence[str], *, ratios: bool = True) -> 
         assert masses.height > 0
         if ratios:
             assert run.analyze(site=site)["tasks"].height > 0
+
+
+def check_total_effect(case: PolicyCase, path: Path, tokenizer: Any, word: str, by_hand: Tensor) -> None:
+    """Compare the stored effect of a word, cut for all queries, with the actions of a call changed by hand.
+
+    by_hand: (1, action, number).
+    """
+    with (
+        va.record(
+            path / "effects.zarr", case.policy, layout=case.layout, tokenizer=tokenizer, untrained=True, durable=False,
+            effects=va.EffectSettings(("text",)),
+        ) as run,
+        run.episode(task_id=0, episode_index=0, instruction=case.instruction) as episode,
+        episode.replan(env_step=0, repeat=lambda _call: case.call(case.observation)) as replan,
+    ):  # fmt: skip
+        replan.actions = plain = case.call(case.observation)
+    stored = open_store(path / "effects.zarr").episodes[0]
+    effects = stored.attributes.effects
+    names = [effects.conditions[number].name for number in effects.condition]
+    change = stored.read("effects/change")[names.index(f"without_word_{word}_queries_all")]
+    expected = (by_hand - plain)[0].numpy()
+    np.testing.assert_allclose(change, expected, atol=1e-6)
+    assert np.abs(expected).max() > 1e-3

@@ -7,6 +7,7 @@ argument. docs/my-policy.md says with which versions each was tried, and what wa
 from vla_attention.capture.torch_policies.layouts.act import act
 from vla_attention.capture.torch_policies.layouts.evo1 import evo1
 from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
+from vla_attention.capture.torch_policies.layouts.molmoact2 import molmoact2
 from vla_attention.capture.torch_policies.layouts.multi_task_dit import multi_task_dit
 from vla_attention.capture.torch_policies.layouts.openvla import openvla, openvla_oft
 from vla_attention.capture.torch_policies.layouts.pi0 import pi0_fast, pi0_pytorch, pi0_transformers
@@ -14,6 +15,6 @@ from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 
 __all__ = [
-    "act", "evo1", "gr00t", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch", "pi0_transformers",
-    "smolvla", "xvla",
+    "act", "evo1", "gr00t", "molmoact2", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch",
+    "pi0_transformers", "smolvla", "xvla",
 ]  # fmt: skip

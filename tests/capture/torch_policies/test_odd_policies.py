@@ -18,6 +18,7 @@ from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.inspect_calls import inspect
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_modules import CannotRunEager
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import ContributionsUnknown, WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
@@ -698,6 +699,14 @@ def test_what_is_written_after_the_softmax_is_seen(tmp_path, dtype, attend, cut,
     wanted = expected(policy, range(4) if cut else ())
     np.testing.assert_allclose(rows, wanted, atol=2e-6 if dtype is torch.float32 else 4e-3)
     assert set(open_store(tmp_path / "a.zarr").episodes[0].read("joint/key_role")[0][:4]) == {1}
+
+
+def test_a_cuda_graph_that_is_captured_in_the_block_is_refused(tmp_path, monkeypatch):
+    policy = OddPolicy(lambda block, q, k, v: nn.functional.scaled_dot_product_attention(q, k, v))
+    for name in ("is_initialized", "is_current_stream_capturing"):
+        monkeypatch.setattr(torch.cuda, name, lambda: True)
+    with pytest.raises(CannotRunEager, match="Switch the policy's CUDA graphs off"):
+        rows_of(tmp_path, policy)
 
 
 def test_attention_inside_of_vmap_is_refused(tmp_path):
