@@ -232,6 +232,7 @@ class PromptText(Document, frozen=True):
             Where a tokenizer is given, it is an error if it is not called.
         skip_ids: ids that are no text (placeholders for patches): they have no key in `spans`.
         skip_first: number of ids before the first that has a key (placeholders that the policy replaced by another id).
+        skip_last: number of ids behind the last that has a key (an end that the policy embeds and does not compute).
         site: the site whose spans these are; None for every site that has them, at the same keys.
         state_between: texts around the state, where a policy writes its numbers into the prompt, after the instruction.
         generated: the spans of tokens that the policy writes itself before it acts (a subtask), in their order. Their
@@ -243,6 +244,7 @@ class PromptText(Document, frozen=True):
     embedding: str
     skip_ids: tuple[int, ...] = ()
     skip_first: int = 0
+    skip_last: int = 0
     site: str | None = None
     state_between: tuple[str, str] | None = None
     generated: tuple[str, ...] = ()

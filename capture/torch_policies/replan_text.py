@@ -276,10 +276,10 @@ class ReplanText:
         of_text = np.isin(keys, _keys_of(site, spans))
         wrong, known = None, False
         if self.seen.ids is not None and text is not None and text.skip_ids:
-            ids = self.seen.ids[row]
+            ids = self._seen_ids(row)
             is_text = ~np.isin(ids, text.skip_ids)
             is_text[: text.skip_first] = False
-            known = bool(of_text.any()) and len(ids) == np.flatnonzero(of_text)[-1] + 1
+            known = bool(of_text.any()) and len(ids) in (np.flatnonzero(of_text)[-1] + 1, len(keys))
             if known and (is_text != of_text[: len(ids)]).any():
                 first = int(np.argmax(is_text != of_text[: len(ids)]))
                 # Nothing but skipped ids from there on: the padding on the right is among them.
@@ -303,7 +303,13 @@ class ReplanText:
         if self.seen.ids is None or self.layout.text is None:
             return []
         skipped = set(self.layout.text.skip_ids)
-        return [token for token in self.seen.ids[row, self.layout.text.skip_first :].tolist() if token not in skipped]
+        return [token for token in self._seen_ids(row)[self.layout.text.skip_first :].tolist() if token not in skipped]
+
+    def _seen_ids(self, row: int) -> NDArray[np.int64]:
+        """The ids of a row, (token,), but for those behind the last that has a key."""
+        assert self.seen.ids is not None
+        assert self.layout.text is not None
+        return self.seen.ids[row, : self.seen.ids.shape[1] - self.layout.text.skip_last]
 
     def _written_ids(self, row: int) -> list[int]:
         """The ids of the tokens that the policy wrote itself; none where the layout has no spans for them."""

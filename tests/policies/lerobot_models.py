@@ -87,6 +87,13 @@ def chunk_of(policy: Any, seed: int = 0) -> Any:
     return call
 
 
+def preprocessor_of(policy: Any) -> Any:
+    """Return LeRobot's own preparation of an observation for a policy, without statistics."""
+    from lerobot.policies.factory import make_pre_post_processors
+
+    return make_pre_post_processors(policy.config)[0]
+
+
 def small_smolvla(
     folder: Path, text_sizes: Mapping[str, int] = NONE, vision_sizes: Mapping[str, int] = NONE, **changes: Any
 ) -> Any:
@@ -440,3 +447,63 @@ def small_molmoact2(folder: Path, **changes: Any) -> Any:
         **{"chunk_size": 5, "n_action_steps": 4, "setup_type": "robot", "control_mode": "robot"},
     }
     return MolmoAct2Policy(MolmoAct2Config(**{**settings, **changes})).eval()
+
+
+#: As Qwen 2.5 VL's own template, for texts and pictures.
+QWEN_TEMPLATE = (
+    "{% for message in messages %}<|im_start|>{{ message.role }}\n{% for part in message.content %}"
+    "{% if part.type == 'image' %}<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part.text }}{% endif %}"
+    "{% endfor %}<|im_end|>\n{% endfor %}"
+)
+
+
+def small_qwen_vl(folder: Path, text: str, marks: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Write the processor of a small Qwen 2.5 VL into `folder`, and return its configuration's arguments.
+
+    text: whose words are tokens, with those of the instruction. marks: special tokens besides Qwen's.
+    """
+    from transformers import Qwen2_5_VLProcessor, Qwen2Tokenizer, Qwen2VLImageProcessor
+    from transformers.models.qwen2_vl.video_processing_qwen2_vl import Qwen2VLVideoProcessor
+
+    words = f"{INSTRUCTION} {' '.join(WORDS)} {text} system\nuser\nassistant\n"
+    tokenizer = Qwen2Tokenizer().train_new_from_iterator([words] * 2, 400)
+    names = {"vision_start_token_id": "<|vision_start|>", "vision_end_token_id": "<|vision_end|>"}
+    names |= {"image_token_id": "<|image_pad|>", "video_token_id": "<|video_pad|>"}
+    others = ["<|im_start|>", "<|im_end|>", *names.values(), *marks]
+    tokenizer.add_special_tokens({"additional_special_tokens": others, "pad_token": "<|endoftext|>"})
+    patches = {"patch_size": 4, "merge_size": 2, "temporal_patch_size": 2, "min_pixels": 64, "max_pixels": 768}
+    Qwen2_5_VLProcessor(
+        Qwen2VLImageProcessor(**patches), tokenizer, Qwen2VLVideoProcessor(**patches), chat_template=QWEN_TEMPLATE
+    ).save_pretrained(folder)
+    return {
+        "text_config": {
+            **{"hidden_size": 16, "intermediate_size": 24, "num_hidden_layers": 3, "num_attention_heads": 2},
+            **{"num_key_value_heads": 1, "vocab_size": len(tokenizer) + 8, "max_position_embeddings": 256},
+            "rope_parameters": {"rope_type": "default", "rope_theta": 1e4, "mrope_section": [2, 1, 1]},
+            "initializer_range": 0.2,
+        },
+        "vision_config": {
+            **{"depth": 2, "hidden_size": 16, "intermediate_size": 24, "num_heads": 2, "out_hidden_size": 16},
+            **{"patch_size": 4, "spatial_merge_size": 2, "temporal_patch_size": 2, "window_size": 16},
+            **{"fullatt_block_indexes": [1], "initializer_range": 0.2},
+        },
+        "initializer_range": 0.2,
+        **{name: tokenizer.convert_tokens_to_ids(token) for name, token in names.items()},
+    }
+
+
+def small_eo1(folder: Path, **changes: Any) -> Any:
+    """LeRobot 0.6's EO1Policy of three blocks; a small Qwen 2.5 VL with its processor is written into `folder`."""
+    from lerobot.policies.eo1.configuration_eo1 import EO1Config
+    from lerobot.policies.eo1.modeling_eo1 import EO1Policy
+    from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
+
+    vlm = Qwen2_5_VLConfig(**small_qwen_vl(folder, "You are a helpful physical assistant."))
+    torch.manual_seed(0)
+    Qwen2_5_VLForConditionalGeneration(vlm).save_pretrained(folder)
+    settings: dict[str, Any] = {
+        **features(24, 32),
+        **{"vlm_base": str(folder), "dtype": "float32", "image_min_pixels": 64, "image_max_pixels": 768},
+        **{"chunk_size": 5, "n_action_steps": 5, "max_state_dim": 8, "max_action_dim": 8, "num_denoise_steps": 3},
+    }
+    return EO1Policy(EO1Config(**{**settings, **changes})).eval()

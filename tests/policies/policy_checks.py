@@ -165,7 +165,9 @@ def check_contributions(
 
     with kept_outputs([module for module, _ in places], numbers) as kept:
         case.call(case.observation)
-    seen = [[call[number[which]] for call in calls] for calls, (_, which) in zip(kept, places, strict=True)]
+    # Before the denoise steps, the same modules may compute a prefix.
+    last = 0 if case.layout.autoregressive else -case.layout.num_denoise_steps
+    seen = [[call[number[which]] for call in calls[last:]] for calls, (_, which) in zip(kept, places, strict=True)]
     expected = []
     for block, before, after in zip(blocks, seen[::2], seen[1::2], strict=True):
         bias = modules[projection.replace("{block}", str(block))].bias if projection else None

@@ -52,9 +52,7 @@ def policy(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def before(policy):
-    from lerobot.policies.factory import make_pre_post_processors
-
-    return make_pre_post_processors(policy.config)[0]
+    return models.preprocessor_of(policy)
 
 
 @pytest.fixture(scope="module")

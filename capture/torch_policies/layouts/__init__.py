@@ -5,6 +5,7 @@ argument. docs/my-policy.md says with which versions each was tried, and what wa
 """
 
 from vla_attention.capture.torch_policies.layouts.act import act
+from vla_attention.capture.torch_policies.layouts.eo1 import eo1
 from vla_attention.capture.torch_policies.layouts.evo1 import evo1
 from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
 from vla_attention.capture.torch_policies.layouts.molmoact2 import molmoact2
@@ -15,6 +16,6 @@ from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 
 __all__ = [
-    "act", "evo1", "gr00t", "molmoact2", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch",
+    "act", "eo1", "evo1", "gr00t", "molmoact2", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch",
     "pi0_transformers", "smolvla", "xvla",
 ]  # fmt: skip

@@ -133,33 +133,76 @@ class KeyOrder:
         )
 
 
-def prompt_with_pictures(
-    ids: Sequence[int], placeholder: int, cameras: Sequence[str], size: int, longest: int, layout: str
+def text_and_pictures(
+    ids: Sequence[int], placeholder: int, cameras: Sequence[str], pictures: int | Sequence[PatchGrid], layout: str
 ) -> tuple[KeyOrder, list[str]]:
     """Return the keys of a vision-language model's tokens, and the names of its text spans in order.
 
     Args:
         ids: of one call without padding; placeholder: the id that stands for a patch.
-        cameras: names of the square pictures in order; size: their sides in pixels.
-        longest: number of tokens of the longest text after the last picture; 0: twice that of `ids`.
+        cameras: names of the pictures in order.
+        pictures: their patches; or the sides in pixels of square ones.
 
     Raises:
         BadArgument: the ids do not hold one picture for each camera.
         NotThisPolicy: a picture is no square of patches.
     """
     runs = [(picture, len(list(run))) for picture, run in groupby(ids, lambda token: token == placeholder)]
-    if sum(picture for picture, _ in runs) != len(cameras) or not runs or runs[-1][0]:
+    found = [count for picture, count in runs if picture]
+    wanted = [] if isinstance(pictures, int) else [grid.num_patches for grid in pictures]
+    if len(found) != len(cameras) or (wanted and wanted != found):
+        expected = f"{listing(wanted)} for the cameras" if wanted else "one for each of the cameras"
         raise BadArgument(
-            f"The ids of one call hold {sum(picture for picture, _ in runs)} runs of placeholders for patches (id "
-            f"{placeholder}), and the text must end them; expected one for each of the cameras {list(cameras)}."
+            f"The ids of one call hold {len(found)} runs of placeholders for patches (id {placeholder}), of "
+            f"{listing(found) or 'none'}; expected {expected} {list(cameras)}."
         )
-    keys, texts, names = KeyOrder(), [], iter(cameras)
-    for number, (picture, count) in enumerate(runs):
-        if picture:
-            side = square(count, "pictures", layout)
-            keys.add_picture(next(names), side, side, size, size)
+    keys, texts, number = KeyOrder(), list[str](), 0
+    for place, (picture, count) in enumerate(runs):
+        if not picture:
+            texts.append(f"template_{place}")
+            keys.add(texts[-1], "text", count, "template")
             continue
-        last = number == len(runs) - 1
-        texts.append("prompt" if last else f"template_{number}")
-        keys.add(texts[-1], "text", (longest or 2 * count) if last else count, "instruction" if last else "template")
+        if isinstance(pictures, int):
+            side = square(count, "pictures", layout)
+            keys.add_picture(cameras[number], side, side, pictures, pictures)
+        else:
+            grid = pictures[number]
+            keys.add_picture(cameras[number], grid.rows, grid.columns, grid.image_height, grid.image_width)
+        number += 1
     return keys, texts
+
+
+def prompt_with_pictures(
+    ids: Sequence[int],
+    placeholder: int,
+    cameras: Sequence[str],
+    pictures: int | Sequence[PatchGrid],
+    longest: int,
+    layout: str,
+) -> tuple[KeyOrder, list[str]]:
+    """Return the same where the text behind the last picture is the prompt, whose length changes: the last text span.
+
+    longest: number of tokens of the longest prompt; 0: twice that of `ids`.
+
+    Raises:
+        BadArgument, NotThisPolicy: as above; or there is no text behind the last picture.
+    """
+    count = next((number for number, token in enumerate(reversed(ids)) if token == placeholder), len(ids))
+    keys, texts = text_and_pictures(ids[: len(ids) - count], placeholder, cameras, pictures, layout)
+    if not count:
+        raise BadArgument(
+            f"The ids of one call end with a placeholder for a patch (id {placeholder}); expected text behind it."
+        )
+    keys.add("prompt", "text", longest or 2 * count, "instruction")
+    return keys, [*texts, "prompt"]
+
+
+def qwen_pictures(image_grid_thw: Sequence[Sequence[int]], vision: Any) -> list[PatchGrid]:
+    """Return the patches of Qwen 2.5 VL's pictures.
+
+    image_grid_thw: frames, rows and columns of each picture before its patches are merged. vision: the configuration of
+    its picture encoder.
+    """
+    merge, patch = vision.spatial_merge_size, vision.patch_size
+    grids = [(int(rows), int(columns)) for _, rows, columns in image_grid_thw]
+    return [PatchGrid(rows // merge, columns // merge, rows * patch, columns * patch) for rows, columns in grids]

@@ -136,13 +136,16 @@ class OneQuery(nn.Module):
 
 
 class PaddedPolicy(nn.Module):
-    """Patches and words in one sequence, padded to the longest of the batch, and one action query at its end."""
+    """Patches and words in one sequence, padded to the longest of the batch, and one action query at its end.
 
-    def __init__(self, side: str) -> None:
+    ended: how many tokens it embeds behind them, which are no keys.
+    """
+
+    def __init__(self, side: str, ended: int = 0) -> None:
         super().__init__()
         torch.manual_seed(0)
         self.words, self.blocks = nn.Embedding(len(WORDS) + 1, 8), nn.ModuleList([OneQuery()])
-        self.side, self.tokenizer = side, WordTokenizer()
+        self.side, self.ended, self.tokenizer = side, ended, WordTokenizer()
 
     @torch.no_grad()
     def act(self, texts: list[str], length: int = 11) -> torch.Tensor:
@@ -151,7 +154,7 @@ class PaddedPolicy(nn.Module):
         ids = torch.tensor(
             [pad + row if self.side == "left" else row + pad for pad, row in zip(pads, rows, strict=True)]
         )
-        keys = self.words(ids)
+        keys = self.words(nn.functional.pad(ids, (0, self.ended), value=1))[:, :length]
         return self.blocks[0](keys, (ids != 0)[:, None, None])
 
 
@@ -178,13 +181,14 @@ def padded_layout(text) -> va.PolicyLayout:
     [
         ({"skip_ids": (IMAGE,)}, ["pick the bowl", "pick up the red bowl"]),
         ({"skip_ids": (IMAGE,)}, ["bowl", "pick up the red bowl"]),  # as many keys as there are patches
+        ({"skip_ids": (IMAGE,), "skip_last": 2}, ["pick the bowl", "pick up the red bowl"]),
         ({"skip_first": 4}, ["pick the bowl", "pick up the red bowl"]),
         ({"skip_first": 4}, ["pick up the bowl", "pick the bowl"]),
         (None, ["pick up the bowl", "pick the bowl"]),
     ],
 )
 def test_padding_on_the_left_moves_the_keys_and_is_refused(tmp_path, texts, text, tokenizer):
-    policy = PaddedPolicy("left")
+    policy = PaddedPolicy("left", (text or {}).get("skip_last", 0))
     settings = {
         "layout": padded_layout(text),
         "tokenizer": policy.tokenizer if tokenizer else None,
