@@ -206,12 +206,12 @@ setup-analyze: .venv/analyze-installed
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps ./examples/lerobot_plugin
 	@touch $@
 
-# Torch without what it asks for, which is 0.7 GB more.
+# Torch without what it asks for, which is 0.7 GB more; what WALL-X asks for, too, since it would bring another torch.
 .venv-lerobot06/installed: pyproject.toml tests/policies/requirements-lerobot06.txt $(wildcard examples/lerobot_plugin/*/*.py)
 	@echo "Installing LeRobot 0.6.1 into .venv-lerobot06 (5 GB, about ten minutes) ..."
 	$(PYTHON312) -m venv .venv-lerobot06
 	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check -e . -r tests/policies/requirements-lerobot06.txt
-	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check --no-deps torch==2.11.0 torchvision==0.26.0 lerobot==0.6.1 av==15.1.0 ./examples/lerobot_plugin
+	.venv-lerobot06/bin/python -m pip install --quiet --disable-pip-version-check --no-deps torch==2.11.0 torchvision==0.26.0 lerobot==0.6.1 av==15.1.0 ./examples/lerobot_plugin peft==0.21.2 accelerate==1.15.0 torchdiffeq==0.2.5 qwen-vl-utils==0.0.14 psutil==7.2.2
 	@touch $@
 
 .venv-numpy1/installed: pyproject.toml

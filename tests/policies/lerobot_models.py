@@ -507,3 +507,34 @@ def small_eo1(folder: Path, **changes: Any) -> Any:
         **{"chunk_size": 5, "n_action_steps": 5, "max_state_dim": 8, "max_action_dim": 8, "num_denoise_steps": 3},
     }
     return EO1Policy(EO1Config(**{**settings, **changes})).eval()
+
+
+def small_wall_x(folder: Path, **changes: Any) -> Any:
+    """LeRobot 0.6's WallXPolicy of three blocks and two experts; a small checkpoint is written into `folder`.
+
+    It computes in float32, but for the embedding, from which LeRobot's code takes bfloat16.
+    """
+    from lerobot.policies.wall_x.configuration_wall_x import WallXConfig
+    from lerobot.policies.wall_x.modeling_wall_x import WallXPolicy
+    from lerobot.policies.wall_x.qwen_model import Qwen2_5_VLConfig
+    from safetensors.torch import save_file
+
+    text = (
+        "You are a helpful assistant. Observation: top view: wrist view: Instruction: Predict the next action in robot"
+    )
+    marks = ("<|propri|>", "<|action|>", "<|action_fast|>")
+    vlm = small_qwen_vl(folder, f"{text} action.\nProprioception: \n", marks)
+    expert = {"hidden_size": 16, "intermediate_size": 24, "hidden_act": "silu"}
+    vlm["text_config"] |= {"num_experts": 2, "experts": [expert] * 2, "dim_inputs": [16, 16], "mlp_moe": True}
+    vlm["text_config"]["dof_config"] = {"arm": 8}
+    Qwen2_5_VLConfig(**vlm, agent_pos_config={"arm": 8}).save_pretrained(folder)
+    save_file({}, folder / "model.safetensors")
+    settings: dict[str, Any] = {
+        **features(24, 32),
+        **{"pretrained_name_or_path": str(folder), "vision_attn_implementation": "sdpa"},
+        **{"chunk_size": 5, "n_action_steps": 5, "max_state_dim": 8, "max_action_dim": 8},
+    }
+    torch.manual_seed(0)
+    policy = WallXPolicy(WallXConfig(**{**settings, **changes})).float().eval()
+    policy.model.model.embed_tokens.to(torch.bfloat16)
+    return policy
