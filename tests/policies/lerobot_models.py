@@ -453,16 +453,19 @@ def small_molmoact2(folder: Path, **changes: Any) -> Any:
 QWEN_TEMPLATE = (
     "{% for message in messages %}<|im_start|>{{ message.role }}\n{% for part in message.content %}"
     "{% if part.type == 'image' %}<|vision_start|><|image_pad|><|vision_end|>{% else %}{{ part.text }}{% endif %}"
-    "{% endfor %}<|im_end|>\n{% endfor %}"
+    "{% endfor %}<|im_end|>\n{% endfor %}{% if add_generation_prompt %}<|im_start|>assistant\n{% endif %}"
 )
 
 
-def small_qwen_vl(folder: Path, text: str, marks: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Write the processor of a small Qwen 2.5 VL into `folder`, and return its configuration's arguments.
+def small_qwen_vl(
+    folder: Path, text: str, marks: tuple[str, ...] = (), processor: str = "Qwen2_5_VLProcessor"
+) -> dict[str, Any]:
+    """Write the processor of a small Qwen VL into `folder`, and return its configuration's arguments, those of 2.5.
 
     text: whose words are tokens, with those of the instruction. marks: special tokens besides Qwen's.
     """
-    from transformers import Qwen2_5_VLProcessor, Qwen2Tokenizer, Qwen2VLImageProcessor
+    import transformers
+    from transformers import Qwen2Tokenizer, Qwen2VLImageProcessor
     from transformers.models.qwen2_vl.video_processing_qwen2_vl import Qwen2VLVideoProcessor
 
     words = f"{INSTRUCTION} {' '.join(WORDS)} {text} system\nuser\nassistant\n"
@@ -472,7 +475,7 @@ def small_qwen_vl(folder: Path, text: str, marks: tuple[str, ...] = ()) -> dict[
     others = ["<|im_start|>", "<|im_end|>", *names.values(), *marks]
     tokenizer.add_special_tokens({"additional_special_tokens": others, "pad_token": "<|endoftext|>"})
     patches = {"patch_size": 4, "merge_size": 2, "temporal_patch_size": 2, "min_pixels": 64, "max_pixels": 768}
-    Qwen2_5_VLProcessor(
+    getattr(transformers, processor)(
         Qwen2VLImageProcessor(**patches), tokenizer, Qwen2VLVideoProcessor(**patches), chat_template=QWEN_TEMPLATE
     ).save_pretrained(folder)
     return {
@@ -507,6 +510,28 @@ def small_eo1(folder: Path, **changes: Any) -> Any:
         **{"chunk_size": 5, "n_action_steps": 5, "max_state_dim": 8, "max_action_dim": 8, "num_denoise_steps": 3},
     }
     return EO1Policy(EO1Config(**{**settings, **changes})).eval()
+
+
+def small_vla_jepa(folder: Path, **changes: Any) -> Any:
+    """LeRobot 0.6's VLAJEPAPolicy, three blocks in Qwen and in the head; a small Qwen 3 VL is written into `folder`."""
+    from lerobot.policies.vla_jepa.configuration_vla_jepa import VLAJEPAConfig
+    from lerobot.policies.vla_jepa.modeling_vla_jepa import VLAJEPAPolicy
+    from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
+
+    text = "Your task is Infer the temporal dynamics from frames and produce the corresponding policy actions."
+    vlm = small_qwen_vl(folder, text, processor="Qwen3VLProcessor")
+    vlm["text_config"]["head_dim"] = 8
+    vlm["vision_config"] |= {"num_position_embeddings": 16, "deepstack_visual_indexes": [0]}
+    torch.manual_seed(0)
+    Qwen3VLForConditionalGeneration(Qwen3VLConfig(**vlm)).save_pretrained(folder)
+    settings: dict[str, Any] = {
+        **features(24, 32),
+        **{"qwen_model_name": str(folder), "torch_dtype": "float32", "enable_world_model": False},
+        **{"chunk_size": 5, "n_action_steps": 5, "num_video_frames": 4, "num_action_tokens_per_timestep": 2},
+        **{"num_embodied_action_tokens_per_instruction": 4, "num_inference_timesteps": 3, "action_num_layers": 3},
+        **{"action_model_type": "DiT-test", "action_hidden_size": 16},
+    }
+    return VLAJEPAPolicy(VLAJEPAConfig(**{**settings, **changes})).eval()
 
 
 def small_wall_x(folder: Path, **changes: Any) -> Any:
