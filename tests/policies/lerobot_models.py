@@ -563,3 +563,23 @@ def small_wall_x(folder: Path, **changes: Any) -> Any:
     policy = WallXPolicy(WallXConfig(**{**settings, **changes})).float().eval()
     policy.model.model.embed_tokens.to(torch.bfloat16)
     return policy
+
+
+def small_vqbet(**changes: Any) -> Any:
+    """A VQBeTPolicy of three blocks, three observations and two chunks, whose Residual VQ counts as trained."""
+    from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+    from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
+
+    settings: dict[str, Any] = {
+        **features(64, 96, ("top",)),
+        **{"n_obs_steps": 3, "n_action_pred_token": 2, "action_chunk_size": 5, "crop_shape": (48, 64)},
+        **{"spatial_softmax_num_keypoints": 4, "vqvae_n_embed": 4, "vqvae_embedding_dim": 8, "vqvae_enc_hidden_dim": 8},
+        **{"gpt_block_size": 32, "gpt_input_dim": 16, "gpt_output_dim": 16, "gpt_n_layer": 3, "gpt_n_head": 2},
+        **{"gpt_hidden_dim": 16, "pretrained_backbone_weights": None},
+    }
+    torch.manual_seed(0)
+    policy = VQBeTPolicy(VQBeTConfig(**{**settings, **changes})).eval()
+    policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
+    for block in policy.vqbet.policy.transformer.h:
+        torch.nn.init.normal_(block.attn.c_attn.weight, std=0.3)
+    return policy

@@ -14,10 +14,11 @@ from vla_attention.capture.torch_policies.layouts.openvla import openvla, openvl
 from vla_attention.capture.torch_policies.layouts.pi0 import pi0_fast, pi0_pytorch, pi0_transformers
 from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
 from vla_attention.capture.torch_policies.layouts.vla_jepa import vla_jepa
+from vla_attention.capture.torch_policies.layouts.vqbet import vqbet
 from vla_attention.capture.torch_policies.layouts.wall_x import wall_x
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 
 __all__ = [
     "act", "eo1", "evo1", "gr00t", "molmoact2", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch",
-    "pi0_transformers", "smolvla", "vla_jepa", "wall_x", "xvla",
+    "pi0_transformers", "smolvla", "vla_jepa", "vqbet", "wall_x", "xvla",
 ]  # fmt: skip
