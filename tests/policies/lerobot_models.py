@@ -1,4 +1,4 @@
-"""Small random policies of the real classes of LeRobot 0.4.4 and 0.6.1. Install `stand_in_torchvision` first."""
+"""Small random policies of the real classes of LeRobot 0.4.4, 0.5 and 0.6.1. Install `stand_in_torchvision` first."""
 
 from __future__ import annotations
 
@@ -155,7 +155,10 @@ def small_xvla(**changes: Any) -> Any:
         **{"chunk_size": 5, "n_action_steps": 5, "num_denoising_steps": 3, "hidden_size": 32, "depth": 3},
         **{"num_heads": 4, "len_soft_prompts": 3, "num_domains": 2, "dim_time": 8, "max_len_seq": 96},
         **{"tokenizer_max_length": 12, "max_state_dim": 20, "num_image_views": 3, "action_mode": "ee6d"},
-        "florence_config": {"vision_config": vision, "text_config": text, "vocab_size": 100, "projection_dim": 32},
+        "florence_config": {
+            **{"vision_config": vision, "text_config": text, "vocab_size": 100, "projection_dim": 32},
+            "pad_token_id": 1,
+        },
     }
     torch.manual_seed(0)
     policy = XVLAPolicy(XVLAConfig(**{**settings, **changes})).eval()

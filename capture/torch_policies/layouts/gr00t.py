@@ -1,8 +1,8 @@
 """GR00T N1.5 and N1.7: a diffusion transformer over state and action tokens, which reads a vision-language model.
 
-N1.5 (LeRobot 0.4): even blocks read all tokens of that model (`cross`), odd ones the state, learned and action tokens
-(`self`). N1.7 (LeRobot 0.6): even blocks take turns between the text only (`cross_text`) and the
-pictures only (`cross_image`), so that a ratio of both inside one block is undefined.
+N1.5 (LeRobot 0.4, 0.5): even blocks read all tokens of that model (`cross`), odd ones the state, learned and action
+tokens (`self`). N1.7 (LeRobot 0.6): even blocks take turns between the text only (`cross_text`) and the pictures only
+(`cross_image`), so that a ratio of both inside one block is undefined.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def gr00t(
         text=PromptText(tuple(texts), _embedding(found), skip_ids=(placeholder,)),
         action_horizon=horizon,
         action_dim=int(head.action_dim),
-        versions={"lerobot": ("0.4.",) if every is None else ("0.6.",)},
+        versions={"lerobot": ("0.4.", "0.5.") if every is None else ("0.6.",)},
     )
 
 

@@ -19,7 +19,7 @@ from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span, SpanKind
 
 #: Releases that the layouts of LeRobot's policies were tried with.
-LEROBOT: dict[str, tuple[str, ...]] = {"lerobot": ("0.4.", "0.6.")}
+LEROBOT: dict[str, tuple[str, ...]] = {"lerobot": ("0.4.", "0.5.", "0.6.")}
 _PICTURE_PREFIX = re.compile(r"observation\.images?\.?")
 
 

@@ -47,5 +47,5 @@ def multi_task_dit(policy: object) -> PolicyLayout:
         denoise_times=times,
         action_horizon=stop - start,
         action_dim=config.action_feature.shape[0],
-        versions={"lerobot": ("0.6.",)},
+        versions={"lerobot": ("0.5.", "0.6.")},
     )
