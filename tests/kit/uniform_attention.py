@@ -13,7 +13,7 @@ import vla_attention as va
 from vla_attention.schemas.stores.reader import open_store
 
 #: Ends of the names of modules that project queries, and of those that project queries, keys and values in one.
-_QUERIES = ("q_proj", "to_q", "query", "q_b_proj")
+_QUERIES = ("q_proj", "to_q", "query", "q_b_proj", "q")
 _ALL_THREE = ("qkv", "c_attn", "qkv_proj")
 
 

@@ -586,3 +586,55 @@ def small_vqbet(**changes: Any) -> Any:
     for block in policy.vqbet.policy.transformer.h:
         torch.nn.init.normal_(block.attn.c_attn.weight, std=0.3)
     return policy
+
+
+class WanWords:
+    """The calls of FastWAM's tokenizer, with whole words."""
+
+    def __init__(self, longest: int) -> None:
+        self.longest = longest
+
+    def __call__(self, texts: list[str], **_: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return ids and mask (text, token), padded to the longest."""
+        rows = [WordTokenizer().encode(text) for text in texts]
+        ids = torch.tensor([row + [0] * (self.longest - len(row)) for row in rows])
+        return ids, (ids != 0).long()
+
+
+def small_fastwam(**changes: Any) -> Any:
+    """LeRobot 0.6's FastWAMPolicy of three blocks, with a small Wan VAE and UMT5; its tokenizer is a stand-in."""
+    from diffusers import AutoencoderKLWan
+    from lerobot.policies.fastwam import modeling_fastwam as module
+    from lerobot.policies.fastwam.configuration_fastwam import FastWAMConfig
+    from lerobot.policies.fastwam.wan.adapters import WanVideoVAE38
+    from lerobot.policies.fastwam.wan.components import WanTextEncoder
+    from transformers import UMT5Config, UMT5EncoderModel
+
+    torch.manual_seed(0)
+    vae = AutoencoderKLWan(
+        **{"base_dim": 4, "z_dim": 48, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1, "is_residual": True},
+        **{"in_channels": 12, "out_channels": 12, "patch_size": 2, "scale_factor_spatial": 16},
+        **{"latents_mean": [0.0] * 48, "latents_std": [1.0] * 48},
+    )
+    words = UMT5EncoderModel(UMT5Config(vocab_size=100, d_model=16, d_kv=8, d_ff=24, num_layers=2, num_heads=2)).eval()
+    sizes = {"ffn_dim": 24, "text_dim": 16, "freq_dim": 8, "num_heads": 2, "attn_head_dim": 8, "num_layers": 3}
+    settings: dict[str, Any] = {
+        **features(64, 64),
+        **{"torch_dtype": "float32", "image_size": (64, 128), "tokenizer_max_len": 12, "num_inference_steps": 3},
+        **{"action_dim": ACTION_DIM, "proprio_dim": STATE_DIM, "action_horizon": 4, "n_action_steps": 4},
+        **{"num_video_frames": 5, "action_video_freq_ratio": 1},
+        "prompt_template": "robot task {task}",
+        "video_dit_config": {
+            **{**sizes, "hidden_dim": 16, "in_dim": 48, "out_dim": 48, "patch_size": [1, 2, 2], "eps": 1e-6},
+            **{"seperated_timestep": True, "video_attention_mask_mode": "first_frame_causal"},
+        },
+        "action_dit_config": {**sizes, "hidden_dim": 12, "action_dim": ACTION_DIM, "eps": 1e-6},
+    }
+    config = FastWAMConfig(**{**settings, **changes})
+    parts = {
+        "load_pretrained_wan_vae": WanVideoVAE38(device="cpu", pretrained=vae),
+        "load_pretrained_wan_text_encoder": WanTextEncoder(torch.float32, "cpu", pretrained=words),
+        "build_wan_tokenizer": WanWords(config.tokenizer_max_len),
+    }
+    with mock.patch.multiple(module, **{name: mock.Mock(return_value=part) for name, part in parts.items()}):
+        return module.FastWAMPolicy(config).eval()

@@ -7,6 +7,7 @@ argument. docs/my-policy.md says with which versions each was tried, and what wa
 from vla_attention.capture.torch_policies.layouts.act import act
 from vla_attention.capture.torch_policies.layouts.eo1 import eo1
 from vla_attention.capture.torch_policies.layouts.evo1 import evo1
+from vla_attention.capture.torch_policies.layouts.fastwam import fastwam
 from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
 from vla_attention.capture.torch_policies.layouts.molmoact2 import molmoact2
 from vla_attention.capture.torch_policies.layouts.multi_task_dit import multi_task_dit
@@ -19,6 +20,6 @@ from vla_attention.capture.torch_policies.layouts.wall_x import wall_x
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 
 __all__ = [
-    "act", "eo1", "evo1", "gr00t", "molmoact2", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast", "pi0_pytorch",
-    "pi0_transformers", "smolvla", "vla_jepa", "vqbet", "wall_x", "xvla",
+    "act", "eo1", "evo1", "fastwam", "gr00t", "molmoact2", "multi_task_dit", "openvla", "openvla_oft", "pi0_fast",
+    "pi0_pytorch", "pi0_transformers", "smolvla", "vla_jepa", "vqbet", "wall_x", "xvla",
 ]  # fmt: skip
