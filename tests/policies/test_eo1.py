@@ -10,6 +10,7 @@ pytest.importorskip("lerobot.policies.eo1", reason="LeRobot 0.6's, run by make t
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_vlm_models import small_eo1
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -35,7 +36,7 @@ TEMPLATE, LONGER = 7, 2
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    return models.small_eo1(tmp_path_factory.mktemp("qwen"))
+    return small_eo1(tmp_path_factory.mktemp("qwen"))
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ pytest.importorskip("lerobot.policies.fastwam", reason="LeRobot 0.6's, run by ma
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_vlm_models import small_fastwam
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -34,7 +35,7 @@ CHUNK, STEPS, HEADS, DIM, VIDEO, LONGEST, WORDS = 4, 3, 2, 8, 8, 12, len(INSTRUC
 
 @pytest.fixture(scope="module")
 def case():
-    policy = models.small_fastwam()
+    policy = small_fastwam()
     for layer in policy.model.mot.layers:
         # Called as a module, so that hooks see the residual stream before it.
         layer.blocks["action"].norm3 = torch.nn.Sequential(layer.blocks["action"].norm3)

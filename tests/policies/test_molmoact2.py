@@ -12,6 +12,7 @@ pytest.importorskip("lerobot.policies.molmoact2", reason="LeRobot 0.6's, run by 
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_vlm_models import small_molmoact2
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -47,7 +48,7 @@ def ids_of(before: Any, observation: Any) -> list[int]:
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    return models.small_molmoact2(tmp_path_factory.mktemp("molmo"))
+    return small_molmoact2(tmp_path_factory.mktemp("molmo"))
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ pytest.importorskip("lerobot.policies.vla_jepa", reason="LeRobot 0.6's, run by m
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_vlm_models import small_vla_jepa
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -46,7 +47,7 @@ def in_float32():
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    return models.small_vla_jepa(tmp_path_factory.mktemp("qwen"))
+    return small_vla_jepa(tmp_path_factory.mktemp("qwen"))
 
 
 @pytest.fixture(scope="module")

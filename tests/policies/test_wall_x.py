@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("lerobot.policies.wall_x", reason="LeRobot 0.6's, run by make test-policies in .venv-lerobot06")
+pytest.importorskip("lerobot", reason="LeRobot 0.6's, run by make test-policies in .venv-lerobot06")
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
+from tests.policies.lerobot_vlm_models import small_wall_x
 from tests.policies.policy_checks import (
     PolicyCase,
     check_analysis,
@@ -27,6 +28,8 @@ from tests.policies.policy_checks import (
 from tests.policies.word_tokenizer import INSTRUCTION
 from vla_attention.capture.torch_policies.layouts.layout_building import NotThisPolicy
 
+pytestmark = pytest.mark.skipif(not models.IS_06, reason="the class of LeRobot 0.6, in .venv-lerobot06")
+
 CHUNK, PATCHES, STEPS, WORDS = 5, 9, 10, len(INSTRUCTION.split())
 #: Around the task: from "<|vision_end|>\nInstruction:", and to the state; keys more in the layout's prompt.
 BEFORE, AFTER, LONGER = 6, 13, 2
@@ -34,7 +37,7 @@ BEFORE, AFTER, LONGER = 6, 13, 2
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    return models.small_wall_x(tmp_path_factory.mktemp("qwen"))
+    return small_wall_x(tmp_path_factory.mktemp("qwen"))
 
 
 @pytest.fixture(scope="module")
