@@ -234,3 +234,21 @@ def check_total_effect(case: PolicyCase, path: Path, tokenizer: Any, word: str, 
     expected = (by_hand - plain)[0].numpy()
     np.testing.assert_allclose(change, expected, atol=1e-6)
     assert np.abs(expected).max() > 1e-3
+
+
+def check_cut(case: PolicyCase, path: Path, keys: str, by_hand: Tensor) -> None:
+    """Compare the actions of a call whose action queries do not read some keys with those of one changed by hand.
+
+    keys: in the grouping language. by_hand: (1, action, number).
+    """
+    with (
+        va.record(
+            path / "cut.zarr", case.policy, layout=case.layout, untrained=True, durable=False,
+            interventions=va.knockout(keys),
+        ) as run,
+        run.episode(task_id=0, episode_index=0, instruction=case.instruction) as episode,
+        episode.replan(env_step=0) as replan,
+    ):  # fmt: skip
+        replan.actions = changed = case.call(case.observation)
+    torch.testing.assert_close(changed, by_hand, atol=1e-6, rtol=0)
+    assert (changed - case.call(case.observation)).abs().max() > 1e-3

@@ -18,6 +18,7 @@ from tests.policies.policy_checks import (
     check_analysis,
     check_change,
     check_contributions,
+    check_cut,
     check_inspect,
     check_rows,
     check_uniform_attention,
@@ -28,7 +29,6 @@ from tests.policies.policy_checks import (
 )
 from tests.policies.word_tokenizer import INSTRUCTION
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.stores.reader import open_store
 
 CHUNK, STEPS, HEADS, DIM, VIDEO, LONGEST, WORDS = 4, 3, 2, 8, 8, 12, len(INSTRUCTION.split())
 
@@ -146,17 +146,7 @@ def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)
 
 
-def test_the_direct_effect_of_the_state_is_that_of_a_call_in_which_no_action_reads_it(case, tmp_path, monkeypatch):
-    with pytest.raises(BadArgument, match=r"readers=\('action',\)"):
-        va.record(tmp_path / "a.zarr", case.policy, layout=case.layout, effects=va.EffectSettings(("text",)))
-    cut = va.knockout("span:state")
-    with (
-        va.record(tmp_path / "run.zarr", case.policy, layout=case.layout, durable=False, interventions=cut) as run,
-        run.episode(task_id=0, episode_index=0, instruction=INSTRUCTION) as episode,
-        episode.replan(env_step=0) as replan,
-    ):
-        replan.actions = changed = case.call(case.observation)
-    assert len(open_store(tmp_path / "run.zarr").episodes) == 1
+def test_a_cut_of_the_state_is_a_call_in_which_no_action_reads_it(case, tmp_path, monkeypatch):
     expert = case.policy.model.action_expert
     own = expert.pre_dit
 
@@ -166,9 +156,14 @@ def test_the_direct_effect_of_the_state_is_that_of_a_call_in_which_no_action_rea
         return own(context_mask=context_mask, **named)
 
     monkeypatch.setattr(expert, "pre_dit", without_state)
-    torch.testing.assert_close(changed, case.call(case.observation), atol=1e-6, rtol=0)
+    by_hand = case.call(case.observation)
     monkeypatch.undo()
-    assert (changed - case.call(case.observation)).abs().max() > 1e-3
+    check_cut(case, tmp_path, "span:state", by_hand)
+
+
+def test_effects_for_all_queries_are_refused(case, tmp_path):
+    with pytest.raises(BadArgument, match=r"readers=\('action',\)"):
+        va.record(tmp_path / "a.zarr", case.policy, layout=case.layout, effects=va.EffectSettings(("text",)))
 
 
 def test_the_analysis_answers_and_queries_of_zero_have_lift_1(case, tmp_path):

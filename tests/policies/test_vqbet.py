@@ -15,6 +15,7 @@ from tests.policies.policy_checks import (
     check_analysis,
     check_change,
     check_contributions,
+    check_cut,
     check_inspect,
     check_rows,
     check_uniform_attention,
@@ -89,6 +90,16 @@ def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
     rows = rows_of(record(case, tmp_path, replans=1, tokenizer=None, interventions=cut), "self")
     assert not rows[..., 0:QUERY:3].any()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)
+
+
+def test_a_cut_of_a_state_is_a_call_with_another_causal_mask(case, tmp_path):
+    masks = [module.bias for module in attention_of(case)]
+    for mask in masks:
+        mask[..., QUERY, 4] = 0  # the state of the second observation
+    by_hand = case.call(case.observation)
+    for mask in masks:
+        mask.copy_(torch.ones_like(mask).tril())
+    check_cut(case, tmp_path, "span:state_1", by_hand)
 
 
 def test_the_analysis_answers_without_a_ratio_and_queries_of_zero_have_lift_1(case, tmp_path):
