@@ -23,7 +23,8 @@ _NAME = "eo1"
 def eo1(policy: object, batch: Mapping[str, Any], *, prompt_tokens: int = 0) -> PolicyLayout:
     """Return the layout of an `EO1Policy`, or of an object that holds one.
 
-    Site `joint`: each camera's patches and the text around them, the state, the prompt, the actions.
+    Site `joint`: each camera's patches and the text around them, the state, the prompt, the actions. The tokenizer is
+    `_processor.tokenizer` of the step `EO1QwenProcessorStep` of LeRobot's processor.
 
     Args:
         batch: of one environment, as LeRobot's processor gives it to the policy, without padding.

@@ -18,7 +18,7 @@ def fastwam(policy: object) -> PolicyLayout:
 
     Sites: `joint` (keys: pictures, actions) and `cross` (keys: the prompt with its padding, which is not masked, and
     the state), in every block. Words also reach the actions by the tokens of the picture: give effects
-    `readers=("action",)`.
+    `readers=("action",)`. The tokenizer is `policy.model.tokenizer.tokenizer`.
 
     Raises:
         NotThisPolicy: no FastWAMPolicy.

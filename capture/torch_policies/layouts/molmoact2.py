@@ -25,7 +25,8 @@ def molmoact2(
     """Return the layout of a `MolmoAct2Policy` that acts by flow matching, or of an object that holds one.
 
     Sites: `self` (keys: the actions of the chunk) and `cross` (keys: pictures and text). A picture's 14 x 14 tokens
-    stand for 27 x 27 patches, two by two: maps are off by half a token at the right and lower edge.
+    stand for 27 x 27 patches, two by two: maps are off by half a token at the right and lower edge. The tokenizer is
+    `processor.tokenizer` of the step `MolmoAct2PackInputsProcessorStep` of LeRobot's processor.
 
     Args:
         input_ids: the ids of one call without padding, (token,): `batch["input_ids"][0]` behind LeRobot's processor.

@@ -26,7 +26,8 @@ def vla_jepa(policy: object, batch: Mapping[str, Any], *, head: bool = False, pr
 
     Site `joint`, in Qwen, once a call: pictures, prompt, tokens for frames, embodied tokens, which are the queries.
     With `head`, the action head's sites instead, at every denoise step: `cross` (embodied tokens) in even blocks,
-    `self` (state, learned tokens, actions) in odd ones. No key there is a picture or a word.
+    `self` (state, learned tokens, actions) in odd ones. No key there is a picture or a word. The tokenizer is
+    `policy.model.qwen.processor.tokenizer`.
 
     Args:
         batch: of one environment, as LeRobot's processor gives it to the policy.

@@ -25,7 +25,8 @@ _STEPS = 10
 def wall_x(policy: object, batch: Mapping[str, Any], *, prompt_tokens: int = 0) -> PolicyLayout:
     """Return the layout of a `WallXPolicy` that acts by flow matching, or of an object that holds one.
 
-    Site `joint`: each camera's patches and the text around them, the prompt, the state, the actions.
+    Site `joint`: each camera's patches and the text around them, the prompt, the state, the actions. The tokenizer is
+    `policy.model.processor.tokenizer`.
 
     Args:
         batch: of one environment, as LeRobot's processor gives it to the policy.
