@@ -97,8 +97,7 @@ def words_get_through(question: Question) -> list[Finding]:
     elif not (worst.action_changed or 0.0) > _SAME_ACTION:
         sentence = f"They reach the model{seen}, and not the action: told {other}, it is the same."
     else:
-        by = f"the action by {worst.action_changed:.2g} in the policy's own units"
-        sentence = f"Yes: told {other}, the model's input{seen} and its action change ({by})."
+        sentence = f"Yes: told {other}, the model's input{seen} and its action change."
     numbers = {"rows": worst.rows_changed, "action": worst.action_changed, "calls": len(looked)}
     return [Finding(sentence, "Do the words get through?", numbers, limit)]
 

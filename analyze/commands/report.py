@@ -37,6 +37,7 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
     results = list(_answers(question, own))
     said = {line for result in results[:1] for line in result.about}
     told: set[str] = set()
+    answered: set[tuple[str, str]] = set()
     shown: list[Result] = []
     for number, result in enumerate(results):
         # What several of them show stands once: pictures and tables in the section that is about them.
@@ -50,11 +51,13 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
         notes = [note for note in result.notes if note not in told]
         answers = {one.asks: one.sentence for other in rest for one in other.findings}  # in other words, of more items
         findings = [
-            replace(finding, limit="" if finding.limit in told else finding.limit)
+            finding
             for finding in result.findings
-            if finding.sentence not in told and answers.get(finding.asks, finding.sentence) == finding.sentence
+            if (finding.sentence, finding.limit) not in answered
+            and answers.get(finding.asks, finding.sentence) == finding.sentence
         ]
-        told |= {*result.notes, *(text for finding in result.findings for text in (finding.sentence, finding.limit))}
+        told |= {*result.notes}
+        answered |= {(finding.sentence, finding.limit) for finding in result.findings}
         shown.append(replace(result, about=kept, findings=findings, tables=tables, figures=figures, notes=notes))
     return shown
 

@@ -45,6 +45,8 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "maps": (("item",), ()),
 }
 _TASK = ["suite", "task_id", "instruction"]
+#: In units of an action: what float32 rounds off one. No effect to the bit (a deaf policy) counts as this.
+_LEAST_EFFECT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,8 @@ def _effects(first: Run, other: Run) -> tuple[list[pl.DataFrame], ActionUnits] |
         any_word = {"kind": "prompt", "item_kind": "exchange", "label": "any word exchanged", "reader": "total"}
         exchanged = exchanged.with_columns(**{name: pl.lit(any_word.get(name, "")) for name in (*ITEM, "reader")})
         rows = pl.concat([exchanged, rows.filter(pl.col("reader").is_in(["total", "direct"]))], how="diagonal")
-        tables.append(rows.select(*EPISODE_ID, *ITEM, "reader", value=pl.col("effect").log(2.0)))
+        size = pl.col("effect").clip(lower_bound=_LEAST_EFFECT)
+        tables.append(rows.select(*EPISODE_ID, *ITEM, "reader", value=size.log(2.0)))
     return tables, units
 
 

@@ -71,9 +71,9 @@ def listens(asked: pl.DataFrame) -> Finding:
     right, n = compared.filter(pl.col("told_goal") == pl.col("first")).height, compared.height
     low, high = share_interval(right, n)
     p = "p < 0.001" if found.p_value < 0.001 else f"p = {found.p_value:.2g}"
-    by_chance = f"shuffled instructions: {found.expected - (found.matches - right):.3g} expected, {p}"
+    by_chance = f"with the instructions shuffled, {found.expected - (found.matches - right):.3g} would be; {p}"
     does = f"it did what it was told in {right} of {n} episodes [{low:.0%}, {high:.0%}]"
-    does += " in which the scene allowed something else"
+    does += " in which it could have done another task"
     numbers: dict[str, float | int | str] = {"right": right, "n": n, "low": low, "high": high}
     numbers |= {"expected": found.expected, "p": found.p_value}
     verdict = NOT_SHOWN if found.p_value > SHOWN_AT else NOT_KNOWN

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 import tests.kit.stores as kit
+from tests.kit.archives import example_store
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.commands.analyze import analyze
+from vla_attention.analyze.commands.report import report
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 
@@ -121,6 +124,19 @@ def test_what_every_result_says_stands_once(html: str) -> None:
     text = Page(html).text
     assert text.count("untrained") == 1
     assert text.count("Site 'joint'") == 1
+
+
+def test_no_answer_loses_its_limit() -> None:
+    question = question_about(example_store("cubes"))
+    own = {
+        (one.sentence, one.limit)
+        for name in ("language", "analyze", "words", "objects", "effects")
+        for one in answer_to(name, question.stores, question.settings).findings
+    }
+    shown = {(one.sentence, one.limit) for part in report(question) for one in part.findings}
+    assert len({limit for _, limit in own}) < len(own)  # several have the same one
+    assert len(shown & own) >= 8
+    assert {one for one in shown if one[0] in {sentence for sentence, _ in own}} <= own
 
 
 def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
