@@ -65,7 +65,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "without_sinks": {
         "nargs": "?", "const": "", "metavar": "RULE",
-        "help": "take out keys that take far more than their share in most heads, and list them; a rule as "
+        "help": "take out tokens that take far more than their share in most heads, and list them; a rule as "
         "factor=10,share=0.5,mass=0.3,heads=0.25 (these) says which",
     },
     "save_viz": {"action": "store_true", "help": "also a picture per episode and layer"},

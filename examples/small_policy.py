@@ -2,8 +2,9 @@
 
 Usage: python examples/small_policy.py
 
-Its weights are random, so its numbers mean nothing; docs/my-policy.md explains the recording piece by piece. The policy reads a picture of 8 x 8 pixels in 4 patches, a sentence of up to 6 tokens and a state of 2 numbers, and gives
-3 actions after 4 denoise steps. Needs torch; no simulator, no GPU.
+Its weights are random, so its numbers mean nothing; docs/my-policy.md explains the recording piece by piece. The policy
+reads a picture of 8 x 8 pixels in 4 patches, a sentence of up to 6 tokens and a state of 2 numbers, and gives 3 actions
+after 4 denoise steps. Needs torch; no simulator, no GPU.
 """
 
 from __future__ import annotations

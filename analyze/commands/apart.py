@@ -34,7 +34,7 @@ _GROUPS: dict[str, Scale] = {"fraction": "share", "lift": "positive", "keys": "p
 _COMPARED = {"outcome": of_outcome, "time": of_time}
 #: How an axis is drawn along x: its column, and its name.
 _ALONG = {
-    "time": ("phase", "time (0: first replan, 1: end)"),
+    "time": ("phase", "time (0: first policy call, 1: end)"),
     "layer": ("layer_number", "layer"),
     "head": ("head", "head"),
     "denoise": ("denoise_step", "denoise step"),

@@ -122,7 +122,7 @@ def without_a_side(root: RootAttributes, site: str) -> str:
     if not missing or not root.site(site).layers:
         return ""
     return (
-        f"Site '{site}' has no {' and no '.join(missing)} keys: a ratio of visual to linguistic attention is not "
+        f"Site '{site}' has no {' and no '.join(missing)} tokens: a ratio of visual to linguistic attention is not "
         "defined inside of it. Compare norms of contributions, which sites of different blocks share."
     )
 

@@ -175,7 +175,7 @@ def units_of(stores: Sequence[Store], units: Sequence[str] = (), skip_corrupt: b
     spread = action_spread(actions)
     if not spread.used.any():
         raise BadArgument(
-            f"In {stores[0].path} the actions are the same in every replan and step, so a change has no unit; ask a "
+            f"In {stores[0].path} the actions are the same in every call and step, so a change has no unit; ask a "
             "store of a robot that moves."
         )
     return in_spread(spread)

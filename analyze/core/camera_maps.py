@@ -238,7 +238,7 @@ def camera_names(question: Question, wanted: Sequence[str] | None = None) -> tup
     if not cameras:
         sites = [site.name for site in question.stores[0].attributes.sites if site.pictured]
         raise BadArgument(
-            f"The keys of site '{question.site}' are no patches of pictures that the policy sees; sites with cameras: "
+            f"The tokens of site '{question.site}' are no patches of the pictures; sites with cameras: "
             f"{listing(sites)}. Choose with --site."
         )
     for camera in wanted or ():
@@ -339,7 +339,7 @@ def map_note(layout: SiteLayout, camera: str, outside: float | None) -> str:
         notes.append(f"adds the attention on {listing(placed)}")
     if others:
         share = "" if outside is None else f", with {100 * outside:.1f}% of the camera's attention"
-        notes.append(f"leaves out the keys of {listing(others)}, which lie nowhere in the picture{share}")
+        notes.append(f"leaves out the tokens of {listing(others)}, which lie nowhere in the picture{share}")
     return f"The map of {camera} {' and '.join(notes)}." if notes else ""
 
 

@@ -422,7 +422,7 @@ def ratios_of_shared_replans(first: Levels, other: Levels, name: str) -> tuple[p
         episodes = unlike.select("task_id", "episode_index").unique().sort("task_id", "episode_index")
         names = [episode_name(task, episode) for task, episode in episodes.iter_rows()]
         raise RunsDiffer(
-            f"{listing(names, 6)} of the rerun {name} has other replans than in its base; make the rerun again."
+            f"{listing(names, 6)} of the rerun {name} has other policy calls than in its base; make the rerun again."
         )
     finite = [one.filter(pl.col("value").is_finite()) for one in (shared, theirs)]
     both = finite[0].join(finite[1].select(key), on=key, how="semi").select(key)

@@ -204,7 +204,7 @@ def recorded_effects(
     effects = (item.episode.attributes.effects for item in having)
     silent = {block for one in effects if one is not None for block in one.silent_blocks}
     hybrid = (
-        f"Through softmax only, also where nobody reads it: keys are not cut off in {plural(len(silent), 'block')} "
+        f"Through softmax only, also where nobody reads it: tokens are not cut off in {plural(len(silent), 'block')} "
         f"without softmax attention ({listing(sorted(silent), 3)}). Exchanges of words and pictures are whole."
     )
     notes = (*units.notes, *[hybrid] * bool(silent), *drift, *elsewhere)
@@ -247,7 +247,7 @@ def _label(change: str, kind: str, name: str, instead: str) -> str:
     said = _PARTS.get(name, name) if kind == "part" else of_kind.get(kind, name)
     if change == "only":
         return f"only the {kind if kind in ('pictures', 'text') else said}"
-    return f"random keys, as many as {said}" if change == "random" else said
+    return f"random tokens, as many as {said}" if change == "random" else said
 
 
 def _places(question: Question) -> list[tuple[Question, tuple[str, ...]]]:
@@ -401,7 +401,7 @@ def _drift(episodes: Sequence[_Episode], units: ActionUnits) -> tuple[str, ...]:
         sizes = np.where(np.isin(arrays["condition"], nothing), arrays["chunk"], 0)
         if sizes.size and sizes.max() > most:
             most = float(sizes.max())
-            where = f"replan {int(arrays['replan'][sizes.argmax()])} of {item.episode.name}"
+            where = f"policy call {int(arrays['replan'][sizes.argmax()])} of {item.episode.name}"
     if most <= ROUNDING:
         return ()
     return (

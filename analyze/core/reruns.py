@@ -61,8 +61,8 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
     shapes = [part.arrays["actions"].shape if "actions" in part.arrays else () for part in (mine, theirs)]
     if mine.num_replans != theirs.num_replans or shapes[0] != shapes[1]:
         raise StoreError(
-            f"{where} has {theirs.num_replans} replans and actions of the shape {shapes[1]}, and in its base "
-            f"{mine.num_replans} and {shapes[0]}: these are not the same replans; make the rerun again."
+            f"{where} has {theirs.num_replans} policy calls and actions of the shape {shapes[1]}, and in its base "
+            f"{mine.num_replans} and {shapes[0]}: these are not the same policy calls; make the rerun again."
         )
     if (mine.task_name, mine.instruction) != (theirs.task_name, theirs.instruction):
         raise StoreError(
@@ -75,7 +75,7 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
         replan = min(int(np.argmax(differs)) for differs in differing.values())
         what = [name for name, differs in differing.items() if differs[replan]]
         raise StoreError(
-            f"Replan {replan} of {where} was given {' and '.join(what)} than in its base {base.path}, which the "
+            f"Policy call {replan} of {where} was given {' and '.join(what)} than in its base {base.path}, which the "
             "condition does not change: the base was recorded again since, or the rerun is of another one; make the "
             "rerun again."
         )

@@ -152,14 +152,14 @@ FIELDS = {
     "protocol": "resets are seeded in other ways",
     "image_size": "the simulator drew other pictures",
     "wait_steps": "episodes begin elsewhere",
-    "replan_steps": "replans are taken at other moments",
+    "replan_steps": "policy calls are made at other moments",
     "max_steps": "failed episodes have other lengths",
     "layers": "averages over other layers",
     "denoise_steps": "averages over other denoise steps",
     "heads": "averages over other heads",
     "queries": "averages over other queries",
     "depth": "equal numbers stand for other layers, heads and denoise steps",
-    "layout": "other keys, and with them another uniform baseline",
+    "layout": "other tokens, and with them another even spread",
     "cameras": "the policies are shown other pictures",
     "processing": "observations and prompts are prepared in other ways",
     "simulator": "other versions of the simulator",
@@ -214,7 +214,7 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
         if run.question.site != first.question.site:
             raise MixedPolicies(
                 f"Runs {first.name} and {run.name} would be compared at different sites ({first.question.site} and "
-                f"{run.question.site}): different softmaxes over different keys, whose masses cannot be compared; "
+                f"{run.question.site}): different softmaxes over different tokens, whose masses cannot be compared; "
                 "choose a site that both have with --site."
             )
     waived = {*allowed, *(("max_steps",) if "suite" in allowed and len({run.suites for run in runs}) > 1 else ())}
@@ -266,11 +266,11 @@ def _refuse_families(stores: Sequence[tuple[str, Store]], allowed: bool) -> None
         if family != other_family and not set(sites) & set(other_sites):
             raise MixedPolicies(
                 f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are "
-                "over different keys, and their masses cannot be compared; ask each with vla-attention analyze."
+                "over different tokens, and their masses cannot be compared; ask each with vla-attention analyze."
             )
         if family != other_family and not allowed:
             raise MixedPolicies(
-                f"{what}, which attend over different keys with different uniform baselines; if lifts and ratios at a "
+                f"{what}, which attend over different tokens, so that an even spread differs; if lifts and ratios at a "
                 "site of the same name are to be compared all the same, give --allow-mismatch family."
             )
 

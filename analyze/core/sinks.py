@@ -80,9 +80,7 @@ class SinkRule:
     def __post_init__(self) -> None:
         """Check the numbers."""
         if not 1.0 <= self.factor < np.inf:
-            raise BadArgument(
-                f"The sink factor {self.factor:g} must be at least 1: at 1 a key takes its uniform share."
-            )
+            raise BadArgument(f"The sink factor {self.factor:g} must be at least 1: at 1 a token takes its even share.")
         shares = (("share", self.share, "rows"), ("mass", self.mass, "a row"), ("heads", self.heads, "heads"))
         for name, value, of in shares:
             if not 0.0 < value <= 1.0:
@@ -104,8 +102,8 @@ class SinkRule:
 
     def __str__(self) -> str:
         return (
-            f"more than {self.factor:g} x the uniform share in at least {self.share:.0%} of a head's rows, or on "
-            f"average more than {self.mass:.0%} of a row (then also more than twice its uniform share)"
+            f"more than {self.factor:g} x the even share in at least {self.share:.0%} of a head's rows, or on "
+            f"average more than {self.mass:.0%} of a row (then also more than twice its even share)"
         )
 
 
@@ -288,7 +286,7 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
     for item in selected:
         if not item.valid.any():
             raise BadArgument(
-                f"Every valid key of task {item.task[1]} is a sink by this rule, so that nothing is left without "
+                f"Every valid token of task {item.task[1]} is a sink by this rule, so that nothing is left without "
                 "sinks; give a rule that takes fewer, as --without-sinks factor=20,heads=0.5."
             )
     grouping = replace(question.grouping, name=f"{question.grouping.name}-without-sinks")
@@ -304,17 +302,17 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
     of_rule, also = f"{rule}, in at least {rule.heads:.0%} of the layers' heads", ""
     if left:
         also = (
-            f" Sinks of fewer heads stay in: {plural(left, 'key')}, counted in every task by itself (a rule "
+            f" Sinks of fewer heads stay in: {plural(left, 'token')}, counted in every task by itself (a rule "
             "with a smaller `heads` takes them out too)."
         )
     if num_valid <= rule.factor:
         also += (
-            f" With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is "
-            "all of the row: keys are judged by their mass alone; a smaller factor (--without-sinks factor=2) judges "
+            f" With {num_valid:.3g} valid tokens none can take more than {rule.factor:g} x its even share, which is "
+            "all of the row: tokens are judged by their mass alone; a smaller factor (--without-sinks factor=2) judges "
             "by multiples too."
         )
     if out.is_empty():
-        return f"Without sinks: no key takes {of_rule}, so nothing was taken out.{also}"
+        return f"Without sinks: no token takes {of_rule}, so nothing was taken out.{also}"
     merged = out.group_by("key", "span", "role", "description", maintain_order=True).agg(
         pl.struct("suite", "task_id").n_unique().alias("num_tasks"),
         pl.col("mean_mass").mean(),
@@ -328,7 +326,7 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
     ]
     return (
         f"Without sinks: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and of the valid "
-        f"keys (but not of norms of contributions). A sink takes {of_rule}.{also}"
+        f"tokens (but not of norms of contributions). A sink takes {of_rule}.{also}"
     )
 
 

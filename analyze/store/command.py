@@ -32,8 +32,8 @@ _EXAMPLES = """examples:
   vla-attention store copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
-contributions: norms of what keys add. effects: changes of the action without an item. steps: positions and goals.
-Rows, and everything else that groupings of keys, words, cameras and roles need, are always copied. The copy passes
+contributions: norms of what tokens add. effects: changes of the action without an item. steps: positions and goals.
+Rows, and everything else that groupings of tokens, words, cameras and roles need, are always copied. The copy passes
 verify, and its provenance names the omitted parts.
 
 Several stores have to be of one run configuration: what differs is named. No two of them may hold the same episode. The

@@ -47,7 +47,7 @@ class EffectSettings:
         name="effects-readers",
         metavar="READER",
     )
-    every: int = option("at every N replans only (default: %(default)s)", 1, name="effects-every", least=1)
+    every: int = option("at every Nth policy call only (default: %(default)s)", 1, name="effects-every", least=1)
     denoise_steps: int | None = option(
         "denoise steps of the calls that are made again (default: the policy's; half of them take half the time)",
         None,

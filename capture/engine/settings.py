@@ -36,7 +36,7 @@ class RecordingSettings:
         metavar="BITS",
     )
     contributions: bool = option(
-        "also record what each part of the keys adds to the residual stream, value-weighted (default: yes)", True
+        "also record what each part of the tokens adds to the residual stream, value-weighted (default: yes)", True
     )
     frames: bool = option("also store the model's input images (default: yes)", True)
     effects: EffectSettings | None = None

@@ -35,14 +35,14 @@ class InterventionSettings:
     """What is changed in the policy, as typed; `interventions_of` reads it."""
 
     knockout: tuple[str, ...] = option(
-        "keys that are not read: camera:NAME, word:NAME, object:NAME, role:NAME ..., joined by &, | and - as in "
+        "tokens that are not read: camera:NAME, word:NAME, object:NAME, role:NAME ..., joined by &, | and - as in "
         "groupings; may be given several times",
         (),
         group="interventions: what is changed in the policy, stored with the run (docs/effects.md)",
         action="append",
         metavar="SELECTOR",
     )
-    keep: str | None = option("knock out all other valid keys, but no action keys", None, metavar="SELECTOR")
+    keep: str | None = option("knock out all other valid tokens, but no action tokens", None, metavar="SELECTOR")
     knockout_queries: str | None = option(
         "who does not read them: all (every query that could carry the information on, the default), action (the "
         "action queries alone: what other tokens have read of them stays), prefix (pi: pictures and prompt only) or "
@@ -57,12 +57,12 @@ class InterventionSettings:
         "share of the attention that is taken away, 0 to 1 (default: 1, exactly all of it)", None, metavar="W"
     )
     random_keys: int | None = option(
-        "the control: knock out equally many random keys outside of each group, drawn for every replan",
+        "the control: knock out equally many random tokens outside of each group, drawn for every policy call",
         None,
         metavar="SEED",
     )
     attention: tuple[str, ...] = option(
-        "multiply a group's attention before normalising (SELECTOR=0.5), or make it uniform inside the group "
+        "multiply a group's attention before normalising (SELECTOR=0.5), or spread it evenly inside the group "
         "(SELECTOR=uniform); may be given several times",
         (),
         action="append",
@@ -76,7 +76,9 @@ class InterventionSettings:
         metavar="CAMERA=CHANGE",
     )
     noise_seed: int | None = option("draw the policy's noise from this seed", None)
-    allow_empty: bool = option("leave replans unchanged in which a group has no key, instead of stopping there", False)
+    allow_empty: bool = option(
+        "leave policy calls unchanged in which a group has no token, instead of stopping there", False
+    )
 
 
 def read_interventions(given: argparse.Namespace) -> Interventions:

@@ -81,7 +81,7 @@ class ReplayOutput(StoreOutput):
 
     rerun_of: Path | None = option(
         "the replay of the same frames without interventions, with which `vla-attention compare` then pairs the calls "
-        "of this one, replan by replan",
+        "of this one, policy call by policy call",
         None,
         metavar="BASE.zarr",
     )

@@ -213,7 +213,7 @@ def _spread(question: Question) -> ActionSpread:
     spread = action_spread(steps)
     if not spread.used.any():
         raise BadArgument(
-            "The data set's actions are the same in every replan and step, so a deviation has no unit; give stores "
+            "The data set's actions are the same in every call and step, so a deviation has no unit; give stores "
             "with more episodes."
         )
     return spread

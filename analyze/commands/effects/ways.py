@@ -41,7 +41,7 @@ def ways_of_words(question: Question, episodes: pl.DataFrame, words: pl.DataFram
         some = [row for row in rest if (_side_of_half(row, "pictures_part") > 0) is seen]
         if some:
             several, left = len(some) > 1, [row["direct_part"] for row in some]
-            sizes = f"{min(left):.1%} to {max(left):.1%}" if several else f"{left[0]:.1%}"
+            sizes = " to ".join(dict.fromkeys(f"{size:.1%}" for size in (min(left), max(left))))
             most = max(row["direct_part_high"] for row in some)
             said.append(
                 f"{listing([row['label'] for row in some], MOST_NAMED)} {'act' if several else 'acts'} mostly through "
