@@ -16,19 +16,19 @@ _EXAMPLES = """examples:
   vla-attention example ~/attention    copies into another one
 """
 _QUESTIONS = """\
-{cubes}: 6 episodes of 'touch the red (green, blue) cube' by pi05_cubes, a small trained pi0.5
-{cubes_one_colour}: the same by a copy of it to which the three colours are one word
+{cubes}: 6 episodes of 'touch the red (green, blue) cube' by pi05_cubes, a small trained pi0.5. It listens, and it
+  looks for the cube that is named
+{cubes_one_colour}: the same by a copy of it to which the three colours are one word. It does not listen, and fails
 {cubes_noise}: the first policy calls of {cubes} again, with other noise
 
-Try:
-  vla-attention language {cubes}
-  vla-attention analyze {cubes}
-  vla-attention objects {cubes}
-  vla-attention effects {cubes}
-  vla-attention failures {cubes_one_colour} --twins {cubes}
-  vla-attention compare {cubes} {cubes_one_colour}
-  vla-attention report {cubes}
-  vla-attention view {cubes}
+Does it listen?           vla-attention language {cubes}
+Looks or reads?           vla-attention analyze {cubes}
+Where does it look?       vla-attention objects {cubes}
+What moves the action?    vla-attention effects {cubes}
+Why did it fail?          vla-attention failures {cubes_one_colour} --twins {cubes}
+What changed?             vla-attention compare {cubes} {cubes_one_colour}
+All of it in one file     vla-attention report {cubes}
+A page to explore         vla-attention view {cubes}
 """
 
 

@@ -27,4 +27,4 @@ def test_an_unchanged_call_that_differs_is_noted_with_its_place(tmp_path, differ
     found = recorded_effects(question_about(path), attention=False)
     assert SMALL_CONDITIONS[0].name not in found.rows().collect()["condition"].to_list()
     assert len(found.notes) == differs
-    assert all("replan 2 of task001_episode000" in note for note in found.notes)
+    assert all("policy call 2 of task001_episode000" in note for note in found.notes)

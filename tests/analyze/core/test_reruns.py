@@ -94,7 +94,7 @@ def refused(base, path):
 def test_one_other_input_of_one_replan_is_named(base, tmp_path, name):
     change, named = INPUTS[name]
     path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), at(change))
-    assert re.search(f"Replan 3 of task001_episode000 of {path} .*{named} .*{base}", refused(base, path))
+    assert re.search(f"Policy call 3 of task001_episode000 of {path} .*{named} .*{base}", refused(base, path))
 
 
 @pytest.mark.parametrize(
@@ -157,4 +157,4 @@ def test_actions_that_the_rerun_found_in_its_base_are_those_of_the_base(base, tm
 
     check(base, write_with(tmp_path / "a.zarr", spec, found(0.0)))
     path = write_with(tmp_path / "b.zarr", spec, found(1e-9))
-    assert re.search(f"Replan 3 of task001_episode000 .*{base} .*{path}", refused(base, path))
+    assert re.search(f"Policy call 3 of task001_episode000 .*{base} .*{path}", refused(base, path))

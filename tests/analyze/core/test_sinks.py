@@ -230,4 +230,4 @@ def test_a_sink_of_some_heads_is_found_and_taken_out_where_it_is_widespread(tmp_
     strict = SinkRule(heads=0.5)
     kept = without_sinks(question, search_sinks(question, strict).sinks, strict)
     assert not any(item.without for item in kept.selected)
-    assert " 2 keys" in kept.notes[-1]
+    assert " 2 tokens" in kept.notes[-1]
