@@ -81,8 +81,8 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
         )
     if own.has("base_actions") and (differs := _array_differs(episode, "actions", own, "base_actions")) is not None:
         raise StoreError(
-            f"Policy call {int(np.argmax(differs))} of {episode.name} has other actions in {base.path} than in the base "
-            f"of which {rerun.path} was made: the base was recorded again since; make the rerun again."
+            f"Policy call {int(np.argmax(differs))} of {episode.name} has other actions in {base.path} than in the "
+            f"base of which {rerun.path} was made: the base was recorded again since; make the rerun again."
         )
 
 

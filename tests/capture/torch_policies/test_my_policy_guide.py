@@ -5,7 +5,7 @@ import re
 from itertools import count
 from pathlib import Path
 
-from tests.kit.small_torch_policy import SmallPolicy, given
+from examples.small_policy import given
 
 GUIDE = Path(__file__).parents[3] / "docs" / "my-policy.md"
 
@@ -22,11 +22,7 @@ class EqualBesidesRounding(doctest.OutputChecker):
 def test_the_guides_examples(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     numbers = count()
-    names = {
-        "policy": SmallPolicy(),
-        "batch": given(),
-        "observe": lambda batch=1: given(batch, seed=next(numbers)),
-    }
+    names = {"observe": lambda batch=1: given(batch, seed=next(numbers))}
     examples = doctest.DocTestParser().get_doctest(GUIDE.read_text(encoding="utf-8"), names, GUIDE.name, str(GUIDE), 0)
     runner = doctest.DocTestRunner(EqualBesidesRounding(), optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     result = runner.run(examples)
