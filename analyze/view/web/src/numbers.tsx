@@ -82,7 +82,7 @@ export function Ratio() {
         <thead>
           <tr>
             <td />
-            <th>keys</th>
+            <th>tokens</th>
             <th>attention</th>
             <th>times even</th>
           </tr>
@@ -127,7 +127,7 @@ function OwnNumbers({ side }: { side: Side }) {
         <thead>
           <tr>
             <td>{nameOf(side)}</td>
-            <th>keys</th>
+            <th>tokens</th>
             <th>attention</th>
             <th>times even</th>
           </tr>
