@@ -15,8 +15,8 @@ WIDTH, LINES = 100, 40
 _WIDTHS, _HEIGHTS = (40, 120), (24, 60)
 #: A table of which fewer rows would fit is left out.
 _FEWEST_ROWS = 3
-#: To so many characters the texts of a column are cut where a table is too wide, first and where that is not enough.
-_SHORT_TEXT, _SHORTEST_TEXT = 24, 10
+#: To so many characters the texts of a column are cut where a table is too wide, and which columns stay then.
+_CUTS: tuple[tuple[int, tuple[str, ...]], ...] = ((24, ("text", "prose")), (20, ()), (10, ()))
 #: Lines that name the tables that did not fit.
 _NAMES_LEFT = 2
 _NO_END = 1_000_000
@@ -111,9 +111,9 @@ def _fitting(table: Table, rows: int, width: int) -> tuple[list[Column], list[li
     def too_wide() -> bool:
         return sum(widths) + 2 * (len(widths) - 1) > width
 
-    # The longest texts are cut first; then the last columns of numbers give way, then texts again, then any column.
+    # The longest texts are cut first; then the last columns give way: of numbers, later any.
     texts = [i for i, column in enumerate(columns) if column.kind == "text"]
-    for shortest, kept in ((_SHORT_TEXT, ("text", "prose")), (_SHORTEST_TEXT, ())):
+    for shortest, kept in _CUTS:
         while too_wide() and texts and max(widths[i] for i in texts) > shortest:
             widths[max(texts, key=lambda i: widths[i])] -= 1
         while too_wide() and len(widths) > 2 and columns[-1].kind not in kept:
