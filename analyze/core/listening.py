@@ -62,9 +62,10 @@ def listens(asked: pl.DataFrame) -> Finding:
     told, first = shown["told_goal"].to_list(), shown["first"].to_list()
     # Where each task has its own initial states, the pictures say what to do as well as the words.
     found = shuffled(told, first, shown["block"].to_list())
-    shared = found.least_p <= SHOWN_AT
+    alike = shown.filter(pl.col("told_goal").n_unique().over("block") > 1)
+    shared = found.least_p <= SHOWN_AT or 2 * alike.height > shown.height
     if shared:
-        compared = shown.filter(pl.col("told_goal").n_unique().over("block") > 1)
+        compared = alike
     else:
         found, compared = shuffled(told, first, shown["stratum"].to_list()), shown
     limits = [_apart(shown, compared, shared)]
@@ -76,7 +77,7 @@ def listens(asked: pl.DataFrame) -> Finding:
     does += " in which it could have done another task"
     numbers: dict[str, float | int | str] = {"right": right, "n": n, "low": low, "high": high}
     numbers |= {"expected": found.expected, "p": found.p_value}
-    verdict = NOT_SHOWN if found.p_value > SHOWN_AT else NOT_KNOWN
+    verdict = TOO_FEW if found.least_p > SHOWN_AT else NOT_SHOWN if found.p_value > SHOWN_AT else NOT_KNOWN
     if found.p_value > SHOWN_AT:
         sentence = f"Not shown to listen: {whatever(compared)}{does}"
         limits.append(_could_show(compared, "block" if shared else "stratum", found.least_p))

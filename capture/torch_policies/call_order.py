@@ -65,6 +65,7 @@ class KnownCalls:
         compared: shapes of calls, without their numbers, of which rows were compared with what the kernel gave.
         sums: by site and block, which of the sums with what attention gave is the residual stream, from 1; where it
             was the same one in all calls that were watched throughout.
+        asked_of_queries: sites of which it was looked at whether their queries are action tokens.
     """
 
     def __init__(self, layout: PolicyLayout) -> None:
@@ -72,6 +73,7 @@ class KnownCalls:
         self.sites = {site.name: site for site in layout.sites}
         self.compared: set[CallShape] = set()
         self.sums: dict[tuple[str, int], int] = {}
+        self.asked_of_queries: set[str] = set()
         self._unlike: set[tuple[str, int]] = set()
         self.blocks = {site.name: site.keys.layers or tuple(range(layout.num_layers)) for site in layout.sites}
         self.rule, self.keys = cache(self._rule), cache(self._keys)

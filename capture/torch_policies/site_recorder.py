@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.capture.torch_policies.replan_contributions import ReplanContributions
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, Note, UserError, listing
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import Recording
 
@@ -174,6 +175,9 @@ class ReplanRecorder(CallOrder):
         queries, recording = place.queries, self.recordings[site.name]
         cell = place.block, 0 if self.layout.autoregressive else place.step
         rows = call.rows(queries)
+        if site.name not in self.known.asked_of_queries:
+            self.known.asked_of_queries.add(site.name)
+            self._look_at_queries(call.shape, queries, site)
         if self._is_checked(call.shape, place, site.name):
             self._check(call, rows, place)
         if self.layout.autoregressive and (problem := self._caches.problem(call, (site.name, place.block))):
@@ -192,6 +196,21 @@ class ReplanRecorder(CallOrder):
         uniform = self._uniform_of(call.allowed(queries), place, site)
         self._uniform[site.name][cell].append(uniform.cpu() if large else uniform)
         return way
+
+    def _look_at_queries(self, shape: CallShape, queries: slice, site: RecordedSite) -> None:
+        """Say where all queries that are recorded are words or patches: in self-attention a query is the key there."""
+        if self.layout.autoregressive or not shape.queries == shape.keys == site.keys.num_keys:
+            return
+        chosen = range(shape.queries)[queries]
+        spans = [span for span in site.keys.spans if any(span.start <= query < span.stop for query in chosen)]
+        if all(span.kind in ("image", "text") for span in spans):
+            warnings.warn(
+                f"The queries {chosen.start} to {chosen.stop - 1} of site '{site.name}', which are recorded as the "
+                f"actions', are tokens of {listing(span.name for span in spans)}. RecordedSite's second argument "
+                "says which queries are actions, for instance (-50, None): the last 50.",
+                Note,
+                stacklevel=2,
+            )
 
     def _is_checked(self, shape: CallShape, place: CallPlace, site: str) -> bool:
         """Whether the rows of a call are compared with what the kernel gave; see `WatchedPlaces`.

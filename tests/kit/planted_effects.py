@@ -61,14 +61,19 @@ def conditions(alike: float = 0.0, exchanged: bool = False) -> dict[str, tuple[I
 
 
 def planted_effects(
-    scale: Callable[[str, int, int, int], float] = lambda *_: 1.0, alike: float = 0.0, exchanged: bool = False
+    scale: Callable[[str, int, int, int], float] = lambda *_: 1.0,
+    alike: float = 0.0,
+    exchanged: bool = False,
+    noise: bool = True,
 ) -> PlantEffects:
     """Every dimension changes by the size, in the sign of a coin; words of other instructions have no entry.
 
     scale: a factor of the size by the name of the condition, task, episode and replan. alike, exchanged: of
-    `conditions`.
+    `conditions`. noise: whether calls were made with other noise.
     """
     planted = conditions(alike, exchanged)
+    if not noise:
+        del planted["noise"]
 
     def plant(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
         return _effects_of(task, episode, replan, tokens, scale, planted)

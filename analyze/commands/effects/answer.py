@@ -18,6 +18,7 @@ from vla_attention.analyze.commands.effects.items import (
     MOST_NAMED,
     NO_NOISE,
     NOT_EXCHANGED,
+    WITHOUT_NOISE,
     by_item,
     columns_of_items,
     exchanged,
@@ -151,6 +152,9 @@ def deciding(words: pl.DataFrame, units: ActionUnits, summary: pl.DataFrame) -> 
         said += f" Also more than noise: {named_sizes(far[1:])}." if far.height > 1 else ""
     elif counted.is_empty():
         said = "No word is shown to move the action."
+    elif tested["noise"].count() == 0:
+        said = f"Most without {top['label']}: {size}."
+        limits.insert(0, WITHOUT_NOISE)
     elif few.height < tested.height:
         said = f"No word is shown to do more than another noise seed. Most without {top['label']}: {size}{noise}."
         limits += _would_be_shown(tested, units)

@@ -32,6 +32,8 @@ _SHOWN, _NOT_SHOWN = "more than another noise seed", "not shown to be more"
 _KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "token", "exchange")
 _READERS = ("total", "direct", "pictures", "text")
 _ALWAYS = ("label", "than_noise")
+#: Said where no call was made with another noise seed.
+WITHOUT_NOISE = "No call was made with other noise. If the policy draws none, none of it is chance."
 #: The rows of calls without a word.
 IS_WORD = (pl.col("kind") == "without") & (pl.col("item_kind") == "word")
 
@@ -119,9 +121,10 @@ def exchanged(question: Question, episodes: pl.DataFrame, units: ActionUnits) ->
     size = units.size(row["effect"], with_interval(row, "effect"))
     said = f"with a word exchanged for another ({listing(words, 2)}) {size}"
     said += "" if row["noise"] is None else f" (another noise seed: {units.short(row['noise'])})"
+    unclear = "Not shown to be more than noise." if row["noise"] is not None else WITHOUT_NOISE
     verdict, limit = {
         MORE: ("It does: ", ""), LESS: ("It does not: ", "")
-    }.get(row["than_noise"], ("", "Not shown to be more than noise."))  # fmt: skip
+    }.get(row["than_noise"], ("", unclear))  # fmt: skip
     numbers = {"estimate": row["effect"], "low": row["effect_low"], "high": row["effect_high"], "noise": row["noise"],
                "q": row["times_noise_q"], "n": row["num_episodes"]}  # fmt: skip
     said = f"{verdict}{said}." if verdict else f"{said[0].upper()}{said[1:]}."

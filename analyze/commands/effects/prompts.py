@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from vla_attention.analyze.commands.effects.items import MORE, beside_noise
+from vla_attention.analyze.commands.effects.items import MORE, WITHOUT_NOISE, beside_noise
 from vla_attention.analyze.core.about import with_interval
 from vla_attention.analyze.core.action_changes import ActionUnits
 from vla_attention.analyze.core.directions import directions, things_of_sentences
@@ -46,9 +46,11 @@ def _moves(found: pl.DataFrame, units: ActionUnits) -> Finding:
     sure, has_noise = found.filter(than_noise=MORE), found["over_noise"].count() > 0
     size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", units.title)
     sizes = dict(found.drop_nulls(size).select("sentence", size).iter_rows())
-    said = "Another sentence moves the action" if sure.height else "No other sentence is shown to move the action"
+    said = "No other sentence is shown to move the action" if has_noise else "Told otherwise, the action changes"
+    said = "Another sentence moves the action" if sure.height else said
     said += f": {listing([f'{kind} {value:.3g}' for kind, value in sizes.items()], 7)} {unit}."
     limit = f"Shown to be more than noise: {listing(sure['sentence'], 7)}." if sure.height else ""
+    limit = limit if has_noise else WITHOUT_NOISE
     return Finding(said, "Does another sentence move it?", sizes | {"n": found["num_episodes"].max()}, limit)
 
 

@@ -21,6 +21,7 @@ from tests.kit.stores import StoreSpec, expected_arrays, write_store
 from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.effects import effects, word_effects
+from vla_attention.analyze.commands.effects.items import WITHOUT_NOISE
 from vla_attention.schemas.layout import Role
 
 REPLANS = 4
@@ -116,6 +117,18 @@ def test_an_effect_below_another_noise_seed_is_said_to_be_smaller(tmp_path):
     result = effects(question_about(write_store(tmp_path / "a.zarr", spec=replace(FEW, plant_effects=plant))))
     assert set(result["effects_items"].filter(pl.col("kind") != "noise")["than_noise"]) == {"less"}
     assert result.findings[0].numbers["shown"] == 0
+
+
+def test_without_other_noise_no_effect_is_called_noise(tmp_path):
+    """As of a policy that draws none."""
+    plant = planted_effects(exchanged=True, noise=False)
+    result = effects(question_about(write_store(tmp_path / "a.zarr", spec=replace(FEW, plant_effects=plant))))
+    apart, missing = result.findings[:2]
+    assert apart.numbers["noise"] is None
+    for finding in (apart, missing):
+        assert finding.numbers["estimate"] > 0
+        assert WITHOUT_NOISE in finding.limit
+        assert "noise" not in finding.sentence
 
 
 def changed(make):

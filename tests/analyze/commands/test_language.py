@@ -23,7 +23,7 @@ from tests.kit.stores import rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.language import language
 from vla_attention.analyze.core.behaviour import with_choices
-from vla_attention.analyze.core.listening import listens, parts_heard
+from vla_attention.analyze.core.listening import TOO_FEW, listens, parts_heard
 from vla_attention.analyze.core.perturbations import by_suite
 from vla_attention.analyze.statistics.exact_tests import at_least, fewer, mcnemar, share_interval, share_shown, shuffled
 from vla_attention.analyze.statistics.many_looks import SHOWN_AT, holm
@@ -61,6 +61,13 @@ def test_a_policy_that_listens_and_one_whose_tasks_the_pictures_tell():
     apart = said(does, state=None)
     assert "listens" not in apart.sentence
     assert apart.limit
+
+
+def test_too_few_episodes_of_one_scene_are_not_said_to_have_scenes_of_their_own():
+    found = said([(task, {task: 9}) for task in (0, 1)])
+    assert (found.numbers["verdict"], found.numbers["p"], found.numbers["expected"]) == (TOO_FEW, 0.5, 1.0)
+    assert "own initial states" not in found.limit
+    assert "0.5" in found.limit
 
 
 @pytest.mark.parametrize("course", [{2: 5}, {0: 3, 1: 6, 2: 9}, {}, {0: 5, 1: 5}])
