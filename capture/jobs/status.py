@@ -199,5 +199,10 @@ def _text(status: StoreStatus) -> str:
         lines.append("The expected number of episodes is unknown; give it with --expected N.")
     elif status.complete:
         lines.append("complete: the store has every expected episode.")
-    lines += [f"being written: {holder.describe()}" for holder in status.writing]
+    lines += [
+        f"left unfinished (its process has ended; a run with --resume begins it anew): {holder.name}"
+        if holder.is_dead
+        else f"being written: {holder.describe()}"
+        for holder in status.writing
+    ]
     return "\n".join(map(visible, lines))

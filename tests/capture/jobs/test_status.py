@@ -21,6 +21,7 @@ from vla_attention.capture.jobs.worker_log import (
     read_logs,
 )
 from vla_attention.schemas.errors import Note
+from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.worker import Worker
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
@@ -52,6 +53,19 @@ def test_without_logs_the_expected_number_is_unknown(store, capsys):
     printed = capsys.readouterr().out
     assert "2 of ?" in printed
     assert "--expected" in printed
+
+
+def test_an_episode_whose_process_has_ended_is_not_being_written(store, capsys):
+    locks = episode_locks(store, NODE)
+    for name in ("task000_episode007", "task000_episode008"):
+        assert locks.acquire(name) is None
+    os.utime(store / ".writing/task000_episode008.lock", (1000, 1000))
+    assert main(["status", str(store)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (writing,) = [line for line in lines if line.startswith("being written: ")]
+    assert "task000_episode007 by node7 (job 98_2)" in writing
+    (left,) = [line for line in lines if "task000_episode008" in line]
+    assert "--resume" in left
 
 
 def test_the_expected_number_can_be_given(store, capsys):
