@@ -101,11 +101,17 @@ _BARS = {
 }
 
 
+_MEANING_OF_Q = (
+    "p of no difference, adjusted for the number of words (Benjamini-Hochberg); the answer names words with q of at most "
+    f"{SHOWN_AT:.2g}"
+)
+
+
 def _columns(num_tasks: int) -> list[Column]:
     return [
         Column("item", "text", "word"),
         Column("lift", "factor", "times even", LIFT),
-        Column("lift_q", "p", "q", "p of no difference, adjusted for the number of words (Benjamini-Hochberg)"),
+        Column("lift_q", "p", "q", _MEANING_OF_Q),
         Column("mass", "percent", "of all attention"),
         Column("share", "percent", "of the text", "part of the attention to all language", screen=False),
         Column("keys", "number", "tokens"),
