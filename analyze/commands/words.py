@@ -102,7 +102,7 @@ _BARS = {
 
 
 _MEANING_OF_Q = (
-    "p of no difference, adjusted for the number of words (Benjamini-Hochberg); the answer names words with q of at most "
+    "p of no difference, adjusted for the number of words (Benjamini-Hochberg); the answer names words of q at most "
     f"{SHOWN_AT:.2g}"
 )
 

@@ -26,6 +26,10 @@ def format_number(value: float | None) -> str:
     return f"{value:.0f}" if value == round(value) else f"{value:.{decimals}f}"
 
 
+#: Sizes and multiples below it are nothing to a reader of a table; the files have them whole.
+_NEXT_TO_NOTHING = 0.001
+
+
 def cell(row: Mapping[str, Any], column: Column) -> str:
     """A column's cell of a row, with its interval where the row has one: `18.2 [17.7, 18.7]`, `12.5% [10.1, 15.0]`.
 
@@ -52,5 +56,7 @@ def _shown(value: float, kind: str) -> str:
         return f"{100 * value:.1f}%"
     if kind == "points":
         return f"{100 * value:+.1f}"
+    if kind in ("number", "factor") and 0 < value < _NEXT_TO_NOTHING:
+        return f"<{_NEXT_TO_NOTHING}"
     sign = "+" if kind == "signed" and value > 0 else ""
     return f"{sign}{format_number(value)}"
