@@ -98,6 +98,23 @@ def test_the_parsers_take_every_command_line(document):
             parser.parse_args(given)  # a mistake ends it with a sentence and 2
 
 
+#: Words of code and files, in whose place sentences say policy call, token, spread evenly.
+OF_CODE = re.compile(r"\b([Rr]eplans?|[Uu]niform(ly)?|[Ee]nrichment)\b")
+
+
+def test_helps_and_pages_say_what_readers_say():
+    parsers = [build_parser([name]) for name in ("pi", "cosmos", "replay")]
+    parsers += [build_analyze_parser(name) for name in COMMANDS]
+    for parser in parsers:
+        inner = [act.choices.values() for act in parser._actions if isinstance(act, argparse._SubParsersAction)]
+        for action in chain.from_iterable(one._actions for one in (parser, *chain.from_iterable(inner))):
+            said = re.sub(r"\([A-Z=]+=uniform\)|\blayer, head.*", "", action.help or "")
+            assert not OF_CODE.search(said), (parser.prog, action.option_strings, action.help)
+    for page in ("../README", "does-it-listen", "groups", "page", "why-did-it-fail", "what-changed", "statistics"):
+        prose = re.sub(r"^```.*?^```|`[^`\n]*`", "", text_of(ROOT / "docs" / f"{page}.md"), flags=re.M | re.S)
+        assert not OF_CODE.search(prose), (page, OF_CODE.search(prose))
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_examples_of_every_help_text_parse(name):
     """Behind an example may stand what it does, after two spaces or more."""

@@ -8,14 +8,12 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import shutil
 from pathlib import Path
 
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, made_up_episodes, write_data_set
 from vla_attention.__main__ import main as every_command
-from vla_attention.capture.__main__ import main as capture
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted((DOCS.parent / "examples").glob("*.ipynb"))
@@ -33,7 +31,8 @@ def run_blocks(text: str, page: str) -> int:
     commands = 0
     for language, block in re.findall(r"^```(bash|python|toml)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         if language == "toml":
-            Path(re.findall(r'^name = "(.*)"$', block, re.MULTILINE)[0] + ".toml").write_text(block)
+            for name in re.findall(r'^name = "(.*)"$', block, re.MULTILINE):  # others are parts of a file
+                Path(f"{name}.toml").write_text(block)
         elif language == "python":
             exec(compile(block, page, "exec"), {})
         else:
@@ -56,23 +55,26 @@ def test_my_checkpoint(tmp_path, monkeypatch, capsys):
     assert Path("results/runs/mine/report/report.html").stat().st_size > 10_000
 
 
-@pytest.fixture(scope="module")
-def captured(tmp_path_factory):
-    """Two episodes of three tasks, as `make capture` records them."""
-    store = tmp_path_factory.mktemp("captured") / "cubes.zarr"
-    assert capture(["pi", "--task", "0", "1", "2", "--num-episodes", "2", "--output", str(store)]) == 0
-    return store
-
-
 @pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.parametrize(
-    "page", ["does-it-listen", "why-did-it-fail", "what-changed", "effects", "reading", "statistics"]
+    "page",
+    ["does-it-listen", "why-did-it-fail", "what-changed", "effects", "reading", "statistics", "groups", "commands"],
 )
-def test_questions_to_a_store(tmp_path, monkeypatch, captured, page):
+def test_questions_to_the_examples(tmp_path, monkeypatch, page):
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(captured, "runs/cubes.zarr")
     assert walk(f"{page}.md") > 0
+
+
+def test_a_store_is_read_without_our_code(tmp_path, monkeypatch, capsys):
+    """The page of the format, on the example that it names."""
+    monkeypatch.chdir(tmp_path)
+    assert every_command(["example"]) == 0
+    capsys.readouterr()
+    assert walk("store.md") == 0
+    printed = capsys.readouterr().out
+    assert "touch the red cube - solved\nbase_0_rgb 0.102\nleft_wrist_0_rgb 0.233\n" in printed
+    assert "True True True" in printed
 
 
 @pytest.mark.thorough
