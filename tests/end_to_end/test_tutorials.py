@@ -75,6 +75,7 @@ def test_a_store_is_read_without_our_code(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "touch the red cube - solved\nbase_0_rgb 0.102\nleft_wrist_0_rgb 0.233\n" in printed
     assert "True True True" in printed
+    assert "False" not in printed
 
 
 @pytest.mark.thorough

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 
 import jsonschema
@@ -229,19 +228,6 @@ def test_other_readers_give_the_numbers_of_members_of_real_size(tmp_path, bits):
     stored = tensorstore.open(kept, read=True).result().read().result()
     assert stored.dtype == (np.float16 if bits == 10 else np.float32)
     assert (stored.astype(np.float32) * np.float32(2.0**-15 if bits == 10 else 1) == rows).all()
-
-
-DOCUMENT = Path(__file__).parents[3] / "docs" / "store.md"
-
-
-@pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL))
-def test_the_examples_of_the_documentation_run(written, tmp_path, monkeypatch, capsys, example):
-    (tmp_path / "run.zarr").symlink_to(written[0])
-    monkeypatch.chdir(tmp_path)
-    exec(compile(example, str(DOCUMENT), "exec"), {})
-    printed = capsys.readouterr().out
-    assert len(printed) > 10
-    assert "False" not in printed
 
 
 def test_an_episode_without_replans_is_refused(tmp_path):
