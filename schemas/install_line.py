@@ -9,9 +9,6 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-#: LIBERO without what it declares (scripts/constraints.txt has the same versions).
-INSTALL_LIBERO = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
-
 
 def install_line(extra: str) -> str:
     """`pip install '/home/me/vla-attention[EXTRA]'`, of a clone; of a wheel or a repository its address.
@@ -19,11 +16,10 @@ def install_line(extra: str) -> str:
     Read from what pip noted of the installation (PEP 610). Without such a note it came from a package index.
     """
     try:
-        noted = distribution("vla-attention").read_text("direct_url.json")
+        origin = json.loads(distribution("vla-attention").read_text("direct_url.json") or "{}")
     except PackageNotFoundError:  # a checkout on Python's path
         roots = [folder for folder in Path(__file__).resolve().parents if (folder / "pyproject.toml").is_file()]
-        noted = json.dumps({"url": roots[0].as_uri(), "dir_info": {"editable": True}}) if roots else None
-    origin = json.loads(noted) if noted else {}
+        origin = {"url": roots[0].as_uri(), "dir_info": {"editable": True}} if roots else {}
     name = f"vla-attention[{extra}]"
     if not origin:
         wanted = name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -10,7 +11,7 @@ import polars as pl
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, perturbed, tables_of
 from vla_attention.analyze.commands.naming_tables import of_runs
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
-from vla_attention.analyze.core.action_changes import ActionUnits
+from vla_attention.analyze.core.action_changes import ROUNDING, ActionUnits
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import Compared, RunValues, by_themselves, compared
 from vla_attention.analyze.core.listening import IN_PART, listens, whatever
@@ -227,11 +228,13 @@ def _needs(part: Compared) -> list[Finding]:
     rows = part.rows["effects"].filter(ALL, reader="total")
     assert part.units is not None
     said = []
-    for row in _largest(rows).iter_rows(named=True):
+    # Of two effects that are rounding, neither is more.
+    sizes = rows.filter(pl.max_horizontal("mean_first", "mean_other") > math.log2(ROUNDING))
+    for row in _largest(sizes).iter_rows(named=True):
         moved_by = part.units.size(2.0 ** row["mean_other"])
         without = "without" if row["kind"] == "without" else "with"
         said.append(f"{without} {row['label']} {moved_by} (against {2.0 ** row['mean_first']:.2g})")
-    numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}
+    numbers = {"items": rows.height, "shown": sizes.filter(_SURE).height}
     maps = part.rows["maps"].filter(ALL) if "maps" in part.rows else rows.clear()
     for row in _largest(maps).iter_rows(named=True):
         on = {"named": "what the sentence names", "robot": "the robot", "other": "neither named things nor the robot"}

@@ -98,17 +98,16 @@ def _why(question: Question, failed: Sequence[SelectedEpisode], num_known: int, 
         said = f"Nothing failed: all {num_known} episodes were solved." if num_known else "No outcome is known."
         return [Finding(said, _WHY, {"failed": 0, "n": num_known}, "" if num_known else _UNKNOWN)]
     numbers = {"failed": len(failed), "n": num_known}
+    places = shlex.join(str(store.path) for store in question.stores)
     begin = f"{len(failed)} of {plural(num_known, 'episode')} failed"
     few = f"Fewer than {_FEW} failures: this describes them and says nothing of others." if len(failed) < _FEW else ""
     if lost.is_empty():
         said = f"{begin}. Nobody knows what they did: the store holds no steps (positions, touches, goals), which our "
-        look = f"vla-attention view {shlex.join(str(store.path) for store in question.stores)}"
-        return [Finding(f"{said}simulators record.", _WHY, numbers, few, look)]
+        return [Finding(f"{said}simulators record.", _WHY, numbers, few, f"vla-attention view {places}")]
     groups = _instead(lost).shown
     parts = [_group(row) for row in groups.head(3).iter_rows(named=True)]
     parts += [f"{rest} did other things"] if (rest := groups["episodes"][3:].sum()) else []
-    language = f"vla-attention language {shlex.join(str(store.path) for store in question.stores)}"
-    return [Finding(f"{begin}. {'; '.join(parts)}.", _WHY, numbers, few, language)]
+    return [Finding(f"{begin}. {'; '.join(parts)}.", _WHY, numbers, few, f"vla-attention language {places}")]
 
 
 def _group(row: dict[str, Any]) -> str:

@@ -56,8 +56,8 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
             if (finding.sentence, finding.limit) not in answered
             and answers.get(finding.asks, finding.sentence) == finding.sentence
         ]
-        told |= {*result.notes}
-        answered |= {(finding.sentence, finding.limit) for finding in result.findings}
+        told.update(result.notes)
+        answered.update((finding.sentence, finding.limit) for finding in result.findings)
         shown.append(replace(result, about=kept, findings=findings, tables=tables, figures=figures, notes=notes))
     return shown
 

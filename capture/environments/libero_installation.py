@@ -29,7 +29,9 @@ from vla_attention.capture.environments.robosuite_installation import (
 )
 from vla_attention.capture.environments.task_families import sentence_template
 from vla_attention.schemas.errors import MissingDependency
-from vla_attention.schemas.install_line import INSTALL_LIBERO
+
+#: LIBERO without what it declares (scripts/constraints.txt has the same versions).
+_INSTALL = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
 
 
 @functools.cache
@@ -40,7 +42,7 @@ def package_folder() -> Path:
         inner = Path(location) / "libero"
         if (inner / "benchmark" / "libero_suite_task_map.py").is_file():
             return inner
-    raise MissingDependency(f"LIBERO (hf-libero) is not installed, and its task suites need it: {INSTALL_LIBERO}.")
+    raise MissingDependency(f"LIBERO (hf-libero) is not installed, and its task suites need it: {_INSTALL}.")
 
 
 @functools.cache
@@ -85,7 +87,7 @@ def load_libero(assets: Path) -> dict[str, Any]:
         with readable_device_choice(), contextlib.redirect_stdout(io.StringIO()):
             environments = importlib.import_module("libero.libero.envs")
     except ImportError as error:
-        raise MissingDependency(f"LIBERO could not be loaded ({error}): {INSTALL_LIBERO}.") from error
+        raise MissingDependency(f"LIBERO could not be loaded ({error}): {_INSTALL}.") from error
     classes: dict[str, Any] = environments.TASK_MAPPING
     return classes
 
@@ -104,7 +106,7 @@ def _import_with_own_configuration(assets: Path) -> ModuleType:
     try:
         return importlib.import_module("libero.libero")
     except ImportError as error:
-        raise MissingDependency(f"LIBERO could not be loaded ({error}): {INSTALL_LIBERO}.") from error
+        raise MissingDependency(f"LIBERO could not be loaded ({error}): {_INSTALL}.") from error
     finally:
         if before is None:
             del os.environ["LIBERO_CONFIG_PATH"]

@@ -200,7 +200,7 @@ def _text(status: StoreStatus) -> str:
     elif status.complete:
         lines.append("complete: the store has every expected episode.")
     lines += [
-        f"left unfinished (its process has ended; a run with --resume begins it anew): {holder.name}"
+        f"left unfinished (its process ended or is silent; a run with --resume begins it anew): {holder.name}"
         if holder.is_dead
         else f"being written: {holder.describe()}"
         for holder in status.writing

@@ -140,7 +140,7 @@ def check_target(path: Path, mode: WriteMode) -> None:
 
 
 #: As a command's option and as an argument of `va.record`.
-RESUME, OVERWRITE = "--resume (in Python resume=True)", "--overwrite (overwrite=True)"
+_OVERWRITE = "--overwrite (overwrite=True)"
 
 
 def refuse_recorded(path: Path) -> None:
@@ -153,8 +153,8 @@ def refuse_recorded(path: Path) -> None:
     read_existing_root(path)
     if count := len(episode_folders(path)):
         raise StoreExists(
-            f"Store {path} exists already and holds {plural(count, 'episode')}; continue it with {RESUME}, delete it "
-            f"and begin again with {OVERWRITE}, or write to another store."
+            f"Store {path} exists already and holds {plural(count, 'episode')}; continue it with "
+            f"--resume (in Python resume=True), delete it and begin again with {_OVERWRITE}, or write to another store."
         )
 
 
@@ -166,7 +166,7 @@ def _take_empty(path: Path, attributes: RootAttributes) -> None:
     if _is_being_recorded(path):
         raise StoreExists(
             f"Store {path} holds no episode yet, and another run is recording its first one; wait for it, delete the "
-            f"store and begin again with {OVERWRITE}, or write to another store."
+            f"store and begin again with {_OVERWRITE}, or write to another store."
         )
     delete_store(path)
 

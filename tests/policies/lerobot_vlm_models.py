@@ -3,14 +3,39 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import torch
 
-from tests.policies.lerobot_models import ACTION_DIM, STATE_DIM, features
+from tests.policies.lerobot_models import (
+    ACTION_DIM,
+    STATE_DIM,
+    chunk_of,
+    features,
+    frames_of,
+    observation,
+    preprocessor_of,
+)
+from tests.policies.policy_checks import PolicyCase
 from tests.policies.word_tokenizer import INSTRUCTION, WORDS, WordTokenizer
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+
+
+def case_of(policy: Any, layout_of: Callable[[Any], PolicyLayout], height: int = 24, width: int = 32) -> PolicyCase:
+    """A policy that is called through LeRobot's own processor. layout_of: a processed batch -> the layout."""
+    given, before = {**observation(height, width), "task": [INSTRUCTION]}, preprocessor_of(policy)
+    chunk = chunk_of(policy)
+    return PolicyCase(
+        policy,
+        layout_of(before(dict(given))),
+        lambda batch: chunk(before(dict(batch))),
+        given,
+        frames_of(given),
+        given["observation.state"],
+    )
 
 
 def small_molmoact2(folder: Path, **changes: Any) -> Any:

@@ -10,9 +10,8 @@ pytest.importorskip("lerobot.policies.eo1", reason="LeRobot 0.6's, run by make t
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
-from tests.policies.lerobot_vlm_models import small_eo1
+from tests.policies.lerobot_vlm_models import case_of, small_eo1
 from tests.policies.policy_checks import (
-    PolicyCase,
     check_analysis,
     check_change,
     check_contributions,
@@ -50,12 +49,9 @@ def tokenizer(before):
 
 
 @pytest.fixture(scope="module")
-def case(policy, before):
-    given = {**models.observation(24, 32), "task": [INSTRUCTION]}
-    layout = va.layouts.eo1(policy, before(dict(given)), prompt_tokens=1 + WORDS + TEMPLATE + LONGER)
-    chunk = models.chunk_of(policy)
-    frames, state = models.frames_of(given), given["observation.state"]
-    return PolicyCase(policy, layout, lambda batch: chunk(before(dict(batch))), given, frames, state)
+def case(policy):
+    longest = 1 + WORDS + TEMPLATE + LONGER
+    return case_of(policy, lambda batch: va.layouts.eo1(policy, batch, prompt_tokens=longest))
 
 
 def layers_of(case):

@@ -12,9 +12,8 @@ pytest.importorskip("lerobot.policies.molmoact2", reason="LeRobot 0.6's, run by 
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
-from tests.policies.lerobot_vlm_models import small_molmoact2
+from tests.policies.lerobot_vlm_models import case_of, small_molmoact2
 from tests.policies.policy_checks import (
-    PolicyCase,
     check_analysis,
     check_change,
     check_contributions,
@@ -62,12 +61,12 @@ def tokenizer(before):
 
 
 @pytest.fixture(scope="module")
-def case(policy, before):
-    given = {**models.observation(24, 24), "task": [INSTRUCTION]}
-    chunk = models.chunk_of(policy)
-    layout = va.layouts.molmoact2(policy, ids_of(before, given), cameras=models.CAMERAS, prompt_tokens=LONGEST)
-    frames, state = models.frames_of(given), given["observation.state"]
-    return PolicyCase(policy, layout, lambda batch: chunk(before(dict(batch))), given, frames, state)
+def case(policy):
+    def layout_of(batch):
+        ids = batch["input_ids"][0].tolist()
+        return va.layouts.molmoact2(policy, ids, cameras=models.CAMERAS, prompt_tokens=LONGEST)
+
+    return case_of(policy, layout_of, 24, 24)
 
 
 def test_inspect_finds_every_block_at_every_denoise_step(case):

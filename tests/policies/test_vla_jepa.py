@@ -13,9 +13,8 @@ pytest.importorskip("lerobot.policies.vla_jepa", reason="LeRobot 0.6's, run by m
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
-from tests.policies.lerobot_vlm_models import small_vla_jepa
+from tests.policies.lerobot_vlm_models import case_of, small_vla_jepa
 from tests.policies.policy_checks import (
-    PolicyCase,
     check_analysis,
     check_change,
     check_contributions,
@@ -57,11 +56,8 @@ def tokenizer(policy):
 
 @pytest.fixture(scope="module")
 def case(policy):
-    given, before = {**models.observation(24, 32), "task": [INSTRUCTION]}, models.preprocessor_of(policy)
-    layout = va.layouts.vla_jepa(policy, before(dict(given)), prompt_tokens=BEFORE + WORDS + AFTER + LONGER)
-    chunk = models.chunk_of(policy)
-    frames, state = models.frames_of(given), given["observation.state"]
-    return PolicyCase(policy, layout, lambda batch: chunk(before(dict(batch))), given, frames, state)
+    longest = BEFORE + WORDS + AFTER + LONGER
+    return case_of(policy, lambda batch: va.layouts.vla_jepa(policy, batch, prompt_tokens=longest))
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,8 @@ pytest.importorskip("lerobot", reason="LeRobot 0.6's, run by make test-policies 
 
 import vla_attention as va
 from tests.policies import lerobot_models as models
-from tests.policies.lerobot_vlm_models import small_wall_x
+from tests.policies.lerobot_vlm_models import case_of, small_wall_x
 from tests.policies.policy_checks import (
-    PolicyCase,
     check_analysis,
     check_change,
     check_contributions,
@@ -47,11 +46,8 @@ def tokenizer(policy):
 
 @pytest.fixture(scope="module")
 def case(policy):
-    given, before = {**models.observation(24, 32), "task": [INSTRUCTION]}, models.preprocessor_of(policy)
-    layout = va.layouts.wall_x(policy, before(dict(given)), prompt_tokens=BEFORE + WORDS + AFTER + LONGER)
-    chunk = models.chunk_of(policy)
-    frames, state = models.frames_of(given), given["observation.state"]
-    return PolicyCase(policy, layout, lambda batch: chunk(before(dict(batch))), given, frames, state)
+    longest = BEFORE + WORDS + AFTER + LONGER
+    return case_of(policy, lambda batch: va.layouts.wall_x(policy, batch, prompt_tokens=longest))
 
 
 def test_inspect_finds_every_block_at_every_denoise_step(case):

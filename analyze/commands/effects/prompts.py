@@ -46,11 +46,15 @@ def _moves(found: pl.DataFrame, units: ActionUnits) -> Finding:
     sure, has_noise = found.filter(than_noise=MORE), found["over_noise"].count() > 0
     size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", units.title)
     sizes = dict(found.drop_nulls(size).select("sentence", size).iter_rows())
-    said = "No other sentence is shown to move the action" if has_noise else "Told otherwise, the action changes"
-    said = "Another sentence moves the action" if sure.height else said
+    if sure.height:
+        said = "Another sentence moves the action"
+    elif has_noise:
+        said = "No other sentence is shown to move the action"
+    else:
+        said = "Told otherwise, the action changes"
     said += f": {listing([f'{kind} {value:.3g}' for kind, value in sizes.items()], 7)} {unit}."
-    limit = f"Shown to be more than noise: {listing(sure['sentence'], 7)}." if sure.height else ""
-    limit = limit if has_noise else WITHOUT_NOISE
+    limit = "" if has_noise else WITHOUT_NOISE
+    limit = f"Shown to be more than noise: {listing(sure['sentence'], 7)}." if sure.height else limit
     return Finding(said, "Does another sentence move it?", sizes | {"n": found["num_episodes"].max()}, limit)
 
 

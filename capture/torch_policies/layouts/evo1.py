@@ -7,6 +7,7 @@ are masked. Every prompt has `Image-1: ` and so on before its pictures, and the 
 from __future__ import annotations
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    LEROBOT_06,
     FoundModule,
     NotThisPolicy,
     camera_name,
@@ -59,5 +60,5 @@ def evo1(policy: object) -> PolicyLayout:
         ),
         action_horizon=config.chunk_size,
         action_dim=config.max_action_dim,
-        versions={"lerobot": ("0.6.",)},
+        versions=LEROBOT_06,
     )

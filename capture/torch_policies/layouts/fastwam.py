@@ -6,7 +6,7 @@ tokens' keys and values in every block are those of `joint`. A camera's patches 
 
 from __future__ import annotations
 
-from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, camera_name
+from vla_attention.capture.torch_policies.layouts.layout_building import LEROBOT_06, FoundModule, KeyOrder, camera_name
 from vla_attention.capture.torch_policies.policy_layout import CameraPicture, PolicyLayout, PromptText
 from vla_attention.schemas.layout import PatchGrid
 
@@ -58,5 +58,5 @@ def fastwam(policy: object) -> PolicyLayout:
         text=None if model.text_encoder is None else PromptText(("prompt",), embedding),
         action_horizon=config.action_horizon,
         action_dim=config.action_dim,
-        versions={"lerobot": ("0.6.",)},
+        versions=LEROBOT_06,
     )

@@ -20,6 +20,8 @@ from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span, SpanKind
 
 #: Releases that the layouts of LeRobot's policies were tried with.
 LEROBOT: dict[str, tuple[str, ...]] = {"lerobot": ("0.4.", "0.5.", "0.6.")}
+#: The same of those that came with 0.6.
+LEROBOT_06: dict[str, tuple[str, ...]] = {"lerobot": ("0.6.",)}
 _PICTURE_PREFIX = re.compile(r"observation\.images?\.?")
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    LEROBOT_06,
     FoundModule,
     KeyOrder,
     NotThisPolicy,
@@ -87,5 +88,5 @@ def molmoact2(
         ),
         action_horizon=returned,
         action_dim=config.action_feature.shape[0],
-        versions={"lerobot": ("0.6.",)},
+        versions=LEROBOT_06,
     )

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    LEROBOT_06,
     FoundModule,
     KeyOrder,
     camera_name,
@@ -64,7 +65,7 @@ def _language_model(found: FoundModule, batch: Mapping[str, Any], prompt_tokens:
     keys.add("prompt_end", "text", behind, "template")
     return keys.layout(
         _NAME,
-        (-len(embodied) - behind, -behind),
+        (-len(embodied) - behind, -behind or None),
         (vlm.text_config.num_hidden_layers, vlm.text_config.num_attention_heads),
         [
             found.rule(
@@ -81,7 +82,7 @@ def _language_model(found: FoundModule, batch: Mapping[str, Any], prompt_tokens:
         ),
         action_horizon=config.chunk_size,
         action_dim=config.action_dim,
-        versions={"lerobot": ("0.6.",)},
+        versions=LEROBOT_06,
     )
 
 
@@ -117,5 +118,5 @@ def _head(found: FoundModule) -> PolicyLayout:
         denoise_times=tuple(step / steps for step in range(steps)),
         action_horizon=config.chunk_size,
         action_dim=config.action_dim,
-        versions={"lerobot": ("0.6.",)},
+        versions=LEROBOT_06,
     )

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    LEROBOT_06,
     FoundModule,
     NotThisPolicy,
     camera_name,
@@ -72,5 +73,5 @@ def wall_x(policy: object, batch: Mapping[str, Any], *, prompt_tokens: int = 0) 
         ),
         action_horizon=config.chunk_size,
         action_dim=config.action_feature.shape[0],
-        versions={"lerobot": ("0.6.",)},
+        versions=LEROBOT_06,
     )

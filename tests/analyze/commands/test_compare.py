@@ -12,6 +12,7 @@ from scipy import stats
 
 import vla_attention as va
 from tests.kit.archives import example_store
+from tests.kit.planted_effects import planted_effects
 from tests.kit.questions import with_attributes
 from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main
@@ -313,6 +314,20 @@ def test_a_deaf_policy_is_said_first(example_pair):
     row = one(found["effects"], scope="all", label="any word exchanged")
     assert row["mean_first"] > 1
     assert row["mean_other"] < 1e-4  # to the deaf policy all colours are one word
+
+
+def test_of_two_effects_that_are_rounding_none_is_said_to_be_more(tmp_path):
+    """One of nothing to the bit, and one that float32 leaves."""
+    sizes = {"a": 3e-5, "b": 0.0}
+    for name, size in sizes.items():
+        # Every task weighs another, so that there is a spread.
+        plant = planted_effects(lambda _, task, *__, size=size: size * (1 + 0.01 * task))
+        write_store(tmp_path / f"{name}.zarr", spec=StoreSpec(tasks=(0, 1, 2, 3), plant_effects=plant))
+    found = compare(open_runs(parse_runs([str(tmp_path / f"{name}.zarr") for name in sizes]), AnalysisSettings()))
+    (needs,) = (finding for finding in found.findings if "depend" in finding.asks)
+    assert needs.numbers["items"] > 0
+    assert needs.numbers["shown"] == 0
+    assert 0 < found["effects"].filter(scope="all")["mean_first"].max() < 1e-3
 
 
 @pytest.fixture
